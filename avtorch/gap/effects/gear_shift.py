@@ -17,7 +17,6 @@ from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
-_REARMED = 1.5  # [m/s] below a shift speed at which the gear counts as changed back, without interruption
 _NEVER = -1e9
 _SHIFTS = 6
 
@@ -28,7 +27,8 @@ class GearShift(Effect):
     """Where the speed rises through one of `speeds` [m/s], a positive command loses the share `depth` for `duration_s`.
 
     Neutral at depth 0. Without `speeds`, they are those of a gearbox with constant ratio: `first_mps`, each next one
-    `gear_ratio` times the previous. The crossing is interpolated between rows, and a row loses drive for the part of
+    `gear_ratio` times the previous. Once the speed has fallen `rearm_mps` below a shift speed, the gear has changed back,
+    without an interruption. The crossing is interpolated between rows, and a row loses drive for the part of
     its step that lies in the interruption, so the response is differentiable in duration and speeds.
 
     Possible are interruptions of 0.02 s (dual clutch) to 2.5 s (automated gearbox of a truck).
@@ -48,6 +48,7 @@ class GearShift(Effect):
     first_mps: Number = 4.5
     gear_ratio: Number = 1.5
     speeds: tuple[float, ...] | None = None
+    rearm_mps: float = 1.5
 
     name = "gear_shift"
     place = "actuator"
@@ -68,7 +69,10 @@ class GearShift(Effect):
         Parameter("first_mps", "m/s", None, 3.0, 7.0, reported=False),
         Parameter("gear_ratio", "-", None, 1.3, 1.8, reported=False),
     )
-    settings = (Domain("speeds", 0.1, 150.0, "m/s", most=16, rising=True),)
+    settings = (
+        Domain("speeds", 0.1, 150.0, "m/s", most=16, rising=True),
+        Domain("rearm_mps", 0.0, 20.0, "m/s"),
+    )
 
     @classmethod
     def in_words(cls, values: Mapping[str, float]) -> str:
@@ -86,7 +90,7 @@ class GearShift(Effect):
         for s, (v_before, above, since) in zip(self._thresholds(), state, strict=True):
             up = ~above & (v > s)
             since = torch.where(up, self._crossing(v_before, v, s, row.time, row.dt), since)
-            above = (above | up) & (v > s - _REARMED)
+            above = (above | up) & (v > s - self.rearm_mps)
             lost = torch.maximum(lost, _covered(since, tensor(self.duration_s), row.time, row.dt))
             after.append((v, above, since))
         return (self._factor(lost, x), 1.0), after
@@ -102,7 +106,7 @@ class GearShift(Effect):
         reach = torch.arange(int(duration.detach().max() / row.dt.min()) + 3)
         for s in thresholds:
             level = s.expand(*shape[:-1], 1).reshape(columns, 1)
-            column, up, until = _upshifts(speed.numpy(), level.detach().numpy())
+            column, up, until = _upshifts(speed.numpy(), level.detach().numpy(), self.rearm_mps)
             at = column, up
             since = self._crossing(speed[column, up - 1], speed[at], level[column, 0], time[at], dt[at])
             rows = up[:, None] + reach
@@ -133,7 +137,7 @@ def _covered(since: Tensor, duration: Tensor, time: Tensor, dt: Tensor) -> Tenso
     return ((torch.minimum(time + dt, since + duration) - torch.maximum(time, since)) / dt).clamp_min(0.0)
 
 
-def _upshifts(v: FloatArray, s: FloatArray) -> tuple[Tensor, Tensor, Tensor]:
+def _upshifts(v: FloatArray, s: FloatArray, rearm: float) -> tuple[Tensor, Tensor, Tensor]:
     """Columns and rows (event,) at which `v` (column, time) has risen through `s` (column, 1), in order, and the row of
     the column's next event. Between two of them the car has been slower by what changes the gear back."""
     steps, above = v.shape[-1], v > s
@@ -144,7 +148,7 @@ def _upshifts(v: FloatArray, s: FloatArray) -> tuple[Tensor, Tensor, Tensor]:
     places = np.stack([fallen[last[again]], risen[again]], -1).ravel()
     slowest = np.minimum.reduceat(v.ravel(), places)[::2] if places.size else np.zeros(0)
     shifted = np.ones(len(risen), bool)
-    shifted[again] = slowest <= s[risen[again] // steps, 0] - _REARMED
+    shifted[again] = slowest <= s[risen[again] // steps, 0] - rearm
     column, row = np.divmod(risen[shifted], steps)
     follows = np.append(column[1:] == column[:-1], False)
     until = np.where(follows, np.append(row[1:], steps), steps)

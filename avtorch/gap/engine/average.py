@@ -1,0 +1,321 @@
+"""The average of visited hypotheses: what each may have beside its effects, and what that is called.
+
+Beside its effects every hypothesis may have a slow random force (gust or road), outliers of the accelerometer, and a
+free form of some family; all are valued in nats of the same likelihood. Each such composition supports labels. Its own
+is its effects by name. But an effect may be an error of the shape of the others, and then the label is without it; a
+free form may be that, too, or a cause without a name, `unknown`. Labels add up what supports them:
+
+    P(label) ~ sum exp(TEMPER (log evidence + log odds))
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from avtorch.gap.engine.coordinates import EFFECTS, base_name
+from avtorch.gap.engine.free_forms import block, families, mirror_columns, tone, wandering
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.likelihood import log_sum
+from avtorch.gap.engine.outliers import Outliers, sensor_outliers
+from avtorch.gap.engine.priors import (
+    EFFECT_NATS,
+    FAINT_OF_RANGE,
+    OUTLIER_NATS,
+    SLOW_FORCE_NATS,
+    TEMPER,
+    UNKNOWN_NATS,
+)
+from avtorch.gap.engine.search import Search
+from avtorch.gap.engine.shape_error import log_prior, relative_size, shape_likelihood, shape_log_odds
+from avtorch.gap.engine.slow_forces import SlowForces, band_covariance, gust_onset, pulling_lags, slow_forces
+from avtorch.gap.simulator.effect import EFFECTS as TABLE
+
+_EXAMINED, _WITHIN = 8, 25.0  # hypotheses, and nats of score behind the best, that are examined in full
+_LINEAR = frozenset({"dead_time", "second_order_actuator", "sensor_lag"})
+_FAINT_GUST = FAINT_OF_RANGE * TABLE["gust"].parameters[0].low
+_LARGE_OF_COMMAND = 0.2  # a slow force has a name, with one channel, from this share of the command's spread on
+_LEAST_LISTED = 1e-4
+
+SLOW = ("none", "gust", "road_grade")
+
+
+@dataclass(frozen=True, eq=False)
+class Composition:
+    """A hypothesis with one free form, or none (`form` empty), and its slow forces.
+
+    `nats` of the form over none; `relative`: size of what it does over the effects' response. `total` (slow force):
+    evidence [nats] with process noise alone, a gust, or a road, errors of shape integrated out. `slow`: at the
+    likeliest error of shape. `gust_onset` [s] or None.
+    """
+
+    form: str
+    nats: float
+    relative: float
+    total: Mapping[str, float]
+    slow: SlowForces
+    gust_onset: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Examined:
+    """A visited `hypothesis` and what it may have beside its effects.
+
+    `exact`: its evidence with an exact shape. `outliers`: of the accelerometer, None without one. `beside` maps an
+    effect to the relative size of what it adds to the others' response, and to the nats that it gains beside them.
+    `mirror` [nats]: gain of linear dynamics that run backwards in time.
+    """
+
+    hypothesis: Hypothesis
+    exact: float
+    compositions: tuple[Composition, ...]
+    outliers: Outliers | None
+    beside: Mapping[str, tuple[float, float]]
+    mirror: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Weight:
+    """One composition under one label: `log_weight` [nats] before tempering, `evidence` the same without odds."""
+
+    label: str
+    log_weight: float
+    evidence: float
+    examined: Examined = field(repr=False)
+    composition: Composition = field(repr=False)
+    slow: str
+    outliers: bool
+
+
+@dataclass(frozen=True, eq=False)
+class ModelAverage:
+    """Probabilities of labels ("none", "unknown", effects joined by "+" in alphabetical order), and what supports them.
+
+    `probabilities` sum to 1, the most probable first; `best`: the strongest support of each label.
+    """
+
+    probabilities: Mapping[str, float]
+    best: Mapping[str, Weight]
+    examined: tuple[Examined, ...]
+
+    @property
+    def label(self) -> str:
+        """The most probable label."""
+        return next(iter(self.probabilities))
+
+    def marginal(self, effect: str) -> float:
+        """Probability that this effect is among the causes."""
+        return sum(p for label, p in self.probabilities.items() if effect in label.split("+"))
+
+
+def examined_sets(search: Search) -> list[Examined]:
+    """The best visited sets, the base, and the best single effects, examined."""
+    ranked = [h for h in search.visited.values() if _acts(h)]
+    ranked.sort(key=lambda h: -_ranking(h))
+    chosen = [h for h in ranked if _ranking(h) > _ranking(ranked[0]) - _WITHIN][:_EXAMINED]
+    for h in [
+        search.visited[()],
+        *[h for h in ranked if h.effects == ["~linear"]][:1],
+        *[h for h in ranked if len(h.effects) == 1][:2],
+    ]:
+        if h not in chosen:
+            chosen.append(h)
+    return [examine(h, search) for h in chosen]
+
+
+def examine(h: Hypothesis, search: Search) -> Examined:
+    """Everything that may be beside the effects of one hypothesis, in nats."""
+    data, alone = h.data, search.alone
+    forms = {name: block(h, form) for name, form in families(h).items()}
+    mirror = 0.0
+    if not alone and data.channel_count == 2 and (forms["linear"].nats > 0 or _LINEAR & set(h.names)):
+        mirror = max(block(h, mirror_columns(h)).nats, 0.0)
+        forms["linear"] = forms["linear"]._replace(nats=forms["linear"].nats - mirror)
+    forms |= wandering(h)
+    lags = pulling_lags(h)
+    first = slow_forces(data, h.residual, h.values, lags=lags)
+    steady = tone(h, 0.1 if max(first.gust, first.road) < 30 else 0.4).fit
+    forms["tone"] = steady._replace(nats=steady.nats - 5)
+    exact = h.evidence - log_sum(h.shape_log)
+    compositions = [_composed(h, "", 0.0, h.residual, exact, lags)]
+    assert compositions[0] is not None
+    late = None
+    if compositions[0].slow.gust > 4:
+        nats, late = gust_onset(data, h.residual, first)
+        late = late if nats > 2 else None
+        compositions[0] = _set_in(compositions[0], nats, late)
+    for name, found in forms.items():
+        if found.residual is None:
+            continue
+        c = _composed(h, name, found.nats, found.residual, exact, lags, least=3.0 if alone else -6.0)
+        if c is not None:
+            compositions.append(_set_in(c, nats, late) if late is not None else c)
+    beside = {}
+    for e in h.effects if len(h.effects) > 1 else []:
+        rest = search.without(h, e)
+        if rest is None or e.startswith("~"):
+            continue
+        size = math.inf
+        if rest.effect_energy is not None:
+            size = relative_size(data, h.covariance, h.predicted - rest.predicted, rest.effect_energy)
+        beside[base_name(e)] = (min(size, 99.0), h.evidence - rest.evidence)
+    outliers = sensor_outliers(h) if data.accel is not None else None
+    return Examined(h, exact, tuple(c for c in compositions if c is not None), outliers, beside, mirror)
+
+
+def average(
+    examined: list[Examined],
+    *,
+    alone: bool = False,
+    effects: Collection[str] | None = None,
+    most: int | None = None,
+    prior: Mapping[str, float] | None = None,
+) -> ModelAverage:
+    """The model average over examined hypotheses. `effects`: names that a label may hold; `most` of them; `prior`:
+    weights of causes by name, 1 where not given."""
+    weights = [w for x in examined for w in _weights(x, examined, alone)]
+    if effects is not None or most is not None:
+        allowed = None if effects is None else {*effects, "none", "unknown"}
+        weights = [
+            w
+            for w in weights
+            if (allowed is None or set(w.label.split("+")) <= allowed)
+            and (most is None or len(w.label.split("+")) <= most)
+        ]
+    total: dict[str, list[float]] = {"none": [], "unknown": []}
+    best: dict[str, Weight] = {}
+    for w in weights:
+        given = sum(math.log(max((prior or {}).get(name, 1.0), 1e-300)) for name in w.label.split("+"))
+        total.setdefault(w.label, []).append(TEMPER * w.log_weight + given)
+        if w.label not in best or best[w.label].log_weight < w.log_weight:
+            best[w.label] = w
+    logs = {label: log_sum(x) if x else -np.inf for label, x in total.items()}
+    top = max(logs.values())
+    chances = {label: math.exp(x - top) for label, x in logs.items()}
+    whole = sum(chances.values())
+    listed = {k: v / whole for k, v in chances.items() if v / whole > _LEAST_LISTED or k in ("none", "unknown")}
+    listed = {k: max(v, _LEAST_LISTED) for k, v in listed.items()}
+    whole = sum(listed.values())
+    ordered = sorted(listed.items(), key=lambda kv: -kv[1])
+    return ModelAverage({k: v / whole for k, v in ordered}, best, tuple(examined))
+
+
+# inside ---------------------------------------------------------------------------------------------------------------
+def _ranking(h: Hypothesis) -> float:
+    return h.score
+
+
+def _acts(h: Hypothesis) -> bool:
+    """Whether no effect of the set stands at nothing."""
+    return all(EFFECTS[e].size(h.values, h.neutral) > 0.1 for e in h.effects)
+
+
+def _composed(
+    h: Hypothesis, form: str, nats: float, residual: np.ndarray, exact: float, lags: np.ndarray, least: float = -np.inf
+) -> Composition | None:
+    """Slow forces beside a free form that has left `residual`, at every error of the effects' shape."""
+    data = h.data
+    shape = h.shape if residual is h.residual else shape_likelihood(data, residual, h.effect_energy)
+    logs = np.zeros(1) if shape is None else shape.nats + log_prior(h.effects)
+    over = nats + log_sum(logs) - log_sum(h.shape_log)
+    if form and (over < least or (form == "tone" and nats < 2)):
+        return None
+    parts: dict[str, list[float]] = {name: [] for name in SLOW}
+    best: tuple[float, SlowForces] | None = None
+    for k, value in enumerate(logs):
+        if value < logs.max() - 6:
+            continue
+        given = band_covariance(data, residual)
+        if shape is not None:
+            given = np.ascontiguousarray(shape.covariances[k]), shape.counts[k]
+        found = slow_forces(data, residual, h.values, given=given, lags=lags)
+        covariance, counts = given
+        n = found.bands
+        free = -0.5 * float((counts[:n] * (np.linalg.slogdet(covariance[:n])[1] + data.channel_count)).sum())
+        total = exact + nats + float(value) + found.log_likelihood - free
+        for name, more in zip(SLOW, (0.0, found.gust, found.road), strict=True):
+            parts[name].append(total + more)
+        if best is None or parts["gust"][-1] > best[0]:
+            best = parts["gust"][-1], found
+    assert best is not None
+    relative = 99.0
+    if form and residual is not h.residual and h.effect_energy is not None:
+        relative = relative_size(data, h.covariance, h.residual - residual, h.effect_energy)
+    return Composition(form, over, relative, {k: log_sum(v) for k, v in parts.items()}, best[1])
+
+
+def _set_in(c: Composition, nats: float, onset: float | None) -> Composition:
+    """The composition with a gust that sets in during the drive."""
+    if onset is None:
+        return c
+    return Composition(c.form, c.nats, c.relative, {**c.total, "gust": c.total["gust"] + nats}, c.slow, onset)
+
+
+def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Weight]:
+    h = x.hypothesis
+    named = [e for e in h.effects if not e.startswith("~") and EFFECTS[e].size(h.values, h.neutral) > 1]
+    names = sorted({base_name(e) for e in named})
+    count = sum(not e.startswith("~") for e in h.effects)
+    odds = -EFFECT_NATS * count
+    # outliers that other sets explain are none: more effects may not make more of them
+    spikes = [
+        y.outliers.nats for y in examined if y.outliers is not None and set(y.hypothesis.effects) <= set(h.effects)
+    ]
+    spike = min(spikes) if spikes else -np.inf
+    unnamed = "~linear" in h.effects and not names
+    if alone and not names and max((c.nats for c in x.compositions if c.form), default=0.0) > 10:
+        unnamed = True
+    for c in x.compositions:
+        if alone and c.form and (h.data.channel_count == 1 or c.form == "linear"):
+            continue
+        labels: list[tuple[list[str] | None, float]] = [(names, 0.0)]
+        for effect, (size, gain) in x.beside.items():
+            if effect in names:  # the error of the others' shape
+                others = [e for e in h.effects if base_name(e) != effect]
+                worth = shape_log_odds(size, gain, others) + EFFECT_NATS
+                labels.append(([n for n in names if n != effect], worth))
+        if x.mirror:
+            labels += _echoes(x, names)
+        if c.form:
+            labels = [(None, -UNKNOWN_NATS)] + [
+                (label, worth + shape_log_odds(c.relative, c.nats, h.effects)) for label, worth in labels
+            ]
+        total, kinds = dict(c.total), SLOW
+        if alone:  # some slow force is any drive's
+            large = c.slow.gust_sd > _LARGE_OF_COMMAND * h["K_L"] * float(np.std(h.data.command))
+            kinds = ("gust",) if large and total["gust"] > total["none"] + SLOW_FORCE_NATS else ("none",)
+            total["none"] = max(total["none"], total["gust"] - SLOW_FORCE_NATS)
+        for slow, (label, worth) in itertools.product(kinds, labels):
+            value = odds + worth
+            if slow != "none":
+                sd = c.slow.gust_sd if slow == "gust" else c.slow.road_sd
+                value -= SLOW_FORCE_NATS + (_FAINT_GUST / sd) ** 2
+            if unnamed and not (alone and slow == "gust"):
+                label = None
+            causes = None
+            if label is not None:
+                faint = slow == "gust" and c.slow.gust_sd < _FAINT_GUST
+                causes = label + ([] if slow == "none" or faint else [slow])
+            for outliers in (False, True) if np.isfinite(spike) else (False,):
+                more = spike - OUTLIER_NATS if outliers else 0.0
+                text = "unknown"
+                if causes is not None:
+                    text = "+".join(sorted([*causes, *(["outliers"] if outliers else [])])) or "none"
+                evidence = total[slow] + (spike if outliers else 0.0)
+                yield Weight(text, total[slow] + value + more, evidence, x, c, slow, outliers)
+
+
+def _echoes(x: Examined, names: list[str]) -> list[tuple[list[str] | None, float]]:
+    """Labels without linear dynamics whose gain is within that of the mirrored bank: theirs, or a loop's echo."""
+    h = x.hypothesis
+    base = h.base or h
+    out: list[tuple[list[str] | None, float]] = []
+    for e in sorted(_LINEAR & set(names)):
+        gain = x.beside[e][1] if e in x.beside else h.evidence - base.evidence if len(h.effects) == 1 else None
+        if gain is not None and gain < x.mirror:
+            out.append(([n for n in names if n != e], EFFECT_NATS - max(gain, 0.0) ** 2 / x.mirror))
+    return out

@@ -1,0 +1,458 @@
+"""Drives as the engine sees them: rows of all usable stretches, and their lapped coefficients.
+
+Each stretch is cut into half-overlapping frames of 4 to 10 s and transformed by the modified discrete cosine transform
+(Princen and Bradley 1987; an orthonormal lapped transform): coefficients `(channel, frame, bin)` are real, nearly
+independent for stationary noise, and local in time and frequency. A frame is a block of time, a band of bins a colour.
+Channels are the acceleration [m/s²] and the differenced speed [m/s²]; both keep their noise, whatever its spectrum.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+import numpy as np
+from scipy.fft import dct
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
+
+from avtorch.arrays import BoolArray, FloatArray, IntArray
+from avtorch.errors import InputError
+from avtorch.gap.engine.compiled_plant import GRID_S
+from avtorch.gap.engine.priors import BAND_RATIO, FRAME_S, STANDSTILL_MPS, WARM_S
+from avtorch.io import Log
+from avtorch.io.log import AccelKind
+from avtorch.io.no_command import no_command
+
+_MOST_HZ = 100.0  # rows of faster logs are averaged: nothing above half of it is a car's
+_SMOOTH_S = 0.3  # the speed enters effects smoothed over it
+_START_S = 0.6  # over which the first acceleration is averaged
+_FRAMES = 30  # of a drive, within the limits of their length
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Steps of at most `GRID_S` on which the plant runs; all (grid,) but `accel0`, which counts at `starts`.
+
+    `row`: the row whose command acts in a step.
+    """
+
+    time: FloatArray = field(repr=False)
+    row: IntArray = field(repr=False)
+    speed: FloatArray = field(repr=False)
+    starts: BoolArray = field(repr=False)
+    accel0: FloatArray = field(repr=False)
+
+
+@dataclass(eq=False)
+class DriveData:
+    """Rows of one or several logs of one car, and the coefficients `measured` (channel, frame, bin).
+
+    `time` (row,) [s] runs on through all logs; `stamp` (row,) [s] is the own clock of log number `log` (row,), `source`
+    (row,) the row there, `group` of which are averaged into one. `command` (row,) [m/s²]; `accel` [m/s²] and
+    `speed` [m/s] (row,) or None; `smooth_speed` (row,) [m/s] and `position` (row,) [m], which effects read.
+    `starts` (row,): first rows of stretches, between `bounds` (stretch + 1,). `frames`: first row and number of
+    frames of each stretch that has any; `frame_time` (frame,) [s] their middles. `band_edges` (band + 1,) [bins];
+    `band_of_bin` (bin,); `band_size` (band,) coefficients per channel.
+    `hold`: rows for which the recorder holds a speed, from row `hold_phase` on. `align_s` [s]: delay of the
+    accelerometer in the coefficients, by which both channels are in phase. `raw_accel`: as read, where outliers
+    were replaced.
+    `cache`: tables derived from the shape alone.
+    """
+
+    time: FloatArray
+    stamp: FloatArray
+    log: IntArray
+    source: IntArray
+    command: FloatArray
+    accel: FloatArray | None
+    speed: FloatArray | None
+    smooth_speed: FloatArray
+    position: FloatArray
+    bounds: IntArray
+    dt: float
+    group: int = 1
+    accel_kind: AccelKind = "kinematic"
+    hold: int = 1
+    hold_phase: int = 0
+    align_s: float = 0.0
+    raw_accel: FloatArray | None = None
+    cache: dict[str, Any] = field(default_factory=dict)
+    # of the transform, see `_frame`
+    warm_rows: int = 0
+    frame_rows: int = 0
+    frames: list[tuple[int, int]] = field(default_factory=list)
+    used: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
+    frame_time: FloatArray = field(default_factory=lambda: np.zeros(0))
+    frequency: FloatArray = field(default_factory=lambda: np.zeros(0))
+    band_edges: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    measured: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
+
+    # reading -------------------------------------------------------------------------------------------------------
+    @classmethod
+    def of(cls, logs: Log | Sequence[Log]) -> Self:
+        """The data of one or several logs of one car.
+
+        Raises `InputError` for logs without `accel_cmd`, with different channels, rates or kinds of `accel`, or where
+        no stretch of driving is long enough for two frames.
+        """
+        each = [logs] if isinstance(logs, Log) else list(logs)
+        _same_kind(each)
+        rate = min(log.rate_hz for log in each)
+        group = max(1, int(1.02 * rate / _MOST_HZ))
+        columns: dict[str, list[FloatArray]] = {name: [] for name in ("time", "stamp", "log", "source", "u", "a", "v")}
+        lengths, begin, longest = [0], 0.0, 0.0
+        for number, log in enumerate(each):
+            assert log.accel_cmd is not None
+            for part in _stretches(log):
+                rows = (part.stop - part.start) // group
+                cut = slice(part.start, part.start + rows * group)
+                seconds = rows * group / log.rate_hz
+                longest = max(longest, seconds)
+                if seconds < WARM_S + 2 * FRAME_S[0]:
+                    continue
+
+                def mean(x: FloatArray | None, cut: slice = cut, rows: int = rows) -> FloatArray:
+                    return np.zeros(0) if x is None else x[cut].reshape(rows, group).mean(1)
+
+                columns["time"].append(begin + mean(log.elapsed))
+                columns["stamp"].append(mean(log.time))
+                columns["log"].append(np.full(rows, number))
+                columns["source"].append(np.arange(cut.start, cut.stop, group))
+                columns["u"].append(mean(log.accel_cmd))
+                columns["a"].append(mean(log.accel))
+                columns["v"].append(mean(log.speed))
+                lengths.append(rows)
+            begin += float(log.elapsed[-1]) + 60.0  # no delay reaches from one log into another
+        if len(lengths) == 1:
+            names = ", ".join(dict.fromkeys(log.name for log in each))
+            raise InputError(
+                f"{names}: {longest:.1f} s of driving in one stretch (moving, engaged), needs "
+                f"{WARM_S + 2 * FRAME_S[0]:.0f} s or more"
+            )
+        whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+        bounds = np.cumsum(lengths)
+        dt = float(np.median(np.diff(whole["time"])))
+        accel = whole["a"] if each[0].accel is not None else None
+        speed = whole["v"] if each[0].speed is not None else None
+        data = cls(
+            time=whole["time"],
+            stamp=whole["stamp"],
+            log=whole["log"].astype(np.int64),
+            source=whole["source"].astype(np.int64),
+            command=whole["u"],
+            accel=accel,
+            speed=speed,
+            smooth_speed=_smooth_speed(whole["time"], accel, speed, bounds, dt),
+            position=np.zeros(len(whole["time"])),
+            bounds=bounds,
+            dt=dt,
+            group=group,
+            accel_kind=each[0].accel_kind,
+        )
+        data.position = data._positions()
+        data.hold, data.hold_phase = data._find_hold()
+        data._frame()
+        return data
+
+    # shape ---------------------------------------------------------------------------------------------------------
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return tuple(name for name in ("accel", "speed") if getattr(self, name) is not None)
+
+    @property
+    def channel_count(self) -> int:
+        return len(self.channels)
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.frame_time)
+
+    @property
+    def bin_count(self) -> int:
+        return int(self.band_edges[-1])
+
+    @property
+    def band_count(self) -> int:
+        return len(self.band_edges) - 1
+
+    @property
+    def band_of_bin(self) -> IntArray:
+        return np.repeat(np.arange(self.band_count), np.diff(self.band_edges))
+
+    @property
+    def band_size(self) -> IntArray:
+        return np.diff(self.band_edges) * self.frame_count
+
+    @property
+    def hop_s(self) -> float:
+        return self.frame_rows * self.dt
+
+    @property
+    def starts(self) -> BoolArray:
+        out = np.zeros(len(self.time), bool)
+        out[self.bounds[:-1]] = True
+        return out
+
+    @property
+    def reference_speed(self) -> float:
+        """At which slopes with speed are neutral [m/s]: the mean while moving, as the effects' files have it."""
+        return max(float(self.smooth_speed.mean()), 1e-3)
+
+    @property
+    def window(self) -> FloatArray:
+        M = self.frame_rows
+        return np.sin(np.pi * (np.arange(2 * M) + 0.5) / (2 * M))
+
+    @property
+    def grid(self) -> Grid:
+        if "grid" not in self.cache:
+            self.cache["grid"] = self._grid()
+        return self.cache["grid"]
+
+    # rows to coefficients and back -----------------------------------------------------------------------------------
+    def transform(self, rows: Sequence[FloatArray]) -> FloatArray:
+        """Coefficients (channel, frame, bin) of signals (row,), one a channel."""
+        M, bins = self.frame_rows, self.bin_count
+        h, window = M // 2, self.window
+        out = np.empty((len(rows), len(self.used), bins))
+        for c, x in enumerate(rows):
+            x = np.ascontiguousarray(x)
+            done = 0
+            for first, count in self.frames:
+                stride = x.strides[0]
+                w = np.lib.stride_tricks.as_strided(x[first:], (count, 2 * M), (M * stride, stride)) * window
+                a, b, c_, d = w[:, :h], w[:, h:M], w[:, M : M + h], w[:, M + h :]
+                y = np.concatenate([-c_[:, ::-1] - d, a - b[:, ::-1]], 1)
+                out[c, done : done + count] = _dct4(y)[:, :bins]
+                done += count
+        return out if self.used.all() else out[:, self.used]
+
+    def adjoint(self, coefficients: FloatArray) -> FloatArray:
+        """Rows (row,) whose inner product with a signal is that of `coefficients` (frame, bin) with its transform."""
+        M, h, window = self.frame_rows, self.frame_rows // 2, self.window
+        whole = np.zeros((len(self.used), M))
+        whole[self.used, : self.bin_count] = coefficients
+        y = _dct4(whole)
+        out, done = np.zeros(len(self.time)), 0
+        for first, count in self.frames:
+            a, b = y[done : done + count, :h], y[done : done + count, h:]
+            w = np.concatenate([b, -b[:, ::-1], -a[:, ::-1], -a], 1) * window
+            for k in range(count):
+                out[first + k * M : first + k * M + 2 * M] += w[k]
+            done += count
+        return out
+
+    def below(self, fmax: float) -> DriveData:
+        """The same drives, of which bands that begin below `fmax` [Hz] count."""
+        k = max(int(np.searchsorted(self.frequency[self.band_edges[:-1]], fmax)), 1)
+        return self._with_bins(self.band_edges[: k + 1])
+
+    def only(self, frames: BoolArray) -> DriveData:
+        """The same drives, of which only these `frames` (frame,) count."""
+        other = copy.copy(self)
+        other.cache = {k: v for k, v in self.cache.items() if k == "grid"}
+        other.used = self.used.copy()
+        other.used[self.used] = frames
+        other.frame_time, other.measured = self.frame_time[frames], self.measured[:, frames]
+        return other
+
+    def with_accel(self, accel: FloatArray) -> DriveData:
+        """The same drives with other readings of the accelerometer (row,); those as read stay in `raw_accel`."""
+        other = copy.copy(self)
+        other.raw_accel = self.accel if self.raw_accel is None else self.raw_accel
+        other.accel = accel
+        other.measured = other._measured()
+        return other
+
+    def with_align(self, align_s: float) -> DriveData:
+        """The same drives with the accelerometer, measured and simulated alike, this much later [s]."""
+        other = copy.copy(self)
+        other.align_s = align_s
+        other.measured = other._measured()
+        return other
+
+    # what the recorder does, measured and simulated alike ------------------------------------------------------------
+    def channel_rows(self, accel: FloatArray | None, speed: FloatArray | None) -> list[FloatArray]:
+        """Readings (row,) as the channels that are compared: an aligned acceleration, a differenced speed."""
+        out = [] if accel is None else [self.aligned(accel)]
+        return out if speed is None else [*out, self.speed_difference(speed)]
+
+    def aligned(self, accel: FloatArray) -> FloatArray:
+        """As late as the speed: what shakes the car is then in phase in both."""
+        return np.interp(self.time - self.align_s, self.time, accel) if self.align_s else accel
+
+    def speed_difference(self, speed: FloatArray) -> FloatArray:
+        """Central difference [m/s²], in phase with the acceleration."""
+        out = np.empty_like(speed)
+        out[1:-1] = (speed[2:] - speed[:-2]) / np.maximum(self.time[2:] - self.time[:-2], 0.3 * self.dt)
+        ends, begins = self.bounds[1:] - 1, self.bounds[:-1]
+        out[ends], out[begins] = out[ends - 1], out[begins + 1]
+        return out
+
+    def held(self, x: FloatArray) -> FloatArray:
+        """As a recorder shows it that refreshes every `hold` rows."""
+        if self.hold == 1:
+            return x
+        n = np.arange(len(x))
+        back = n - ((self.source // self.group) - self.hold_phase) % self.hold
+        first = self.bounds[np.searchsorted(self.bounds, n, side="right") - 1]
+        return x[np.maximum(back, first)]
+
+    def low_pass(self, x: FloatArray, time_constant: float) -> FloatArray:
+        """One pole with this mean delay [s], smooth from 0 on."""
+        if time_constant < 1e-4:
+            return x
+        c = time_constant / (time_constant + self.dt)
+        out = np.empty_like(x)
+        for i, j in zip(self.bounds[:-1], self.bounds[1:], strict=True):
+            out[i:j] = lfilter([1 - c], [1, -c], x[i:j], zi=[c * x[i]])[0]
+        return out
+
+    # inside ----------------------------------------------------------------------------------------------------------
+    def _measured(self) -> FloatArray:
+        return self.transform(self.channel_rows(self.accel, self.speed))
+
+    def _with_bins(self, edges: IntArray) -> DriveData:
+        other = copy.copy(self)
+        other.cache = {k: v for k, v in self.cache.items() if k == "grid"}
+        other.band_edges = edges
+        other.frequency = np.ascontiguousarray(self.frequency[: int(edges[-1])])
+        other.measured = np.ascontiguousarray(self.measured[:, :, : edges[-1]])
+        return other
+
+    def _frame(self) -> None:
+        """Cut stretches into frames and bins into bands."""
+        lengths = np.diff(self.bounds)
+        warm = int(WARM_S / self.dt)
+        hop = float(np.clip(lengths.sum() * self.dt / _FRAMES, *FRAME_S))
+        rest = lengths - warm
+        M = min(int(hop / self.dt), int(rest.max()) // 2)
+        if len(rest) == 1:  # frames that fill the one stretch
+            M = int(rest[0]) // (max(int(rest[0]) // M - 1, 1) + 1)
+        M = _even(M)
+        self.warm_rows, self.frame_rows, self.frames = warm, M, []
+        for begin, length in zip(self.bounds[:-1].tolist(), rest.tolist(), strict=True):
+            count = length // M - 1
+            if count >= 1:
+                self.frames.append((begin + warm + (length - (count + 1) * M) // 2, count))
+        self.frame_time = np.concatenate([self.time[i + M * (1 + np.arange(count))] for i, count in self.frames])
+        self.used = np.ones(len(self.frame_time), bool)
+        self.frequency = (np.arange(M) + 0.5) / (2 * M * self.dt)
+        edges = [0, 1, 2, 3]
+        while edges[-1] < M:
+            edges.append(max(edges[-1] + 1, int(edges[-1] * BAND_RATIO)))
+        edges[-1] = M
+        if edges[-1] - edges[-2] < 0.4 * (edges[-2] - edges[-3]):
+            del edges[-2]
+        self.band_edges = np.array(edges)
+        self.measured = self._measured()
+
+    def _positions(self) -> FloatArray:
+        out, offset = np.zeros(len(self.time)), 0.0
+        for i, j in zip(self.bounds[:-1], self.bounds[1:], strict=True):
+            steps = self.smooth_speed[i : j - 1] * np.diff(self.time[i:j])
+            out[i:j] = offset + np.concatenate([[0.0], np.cumsum(steps)])
+            offset = float(out[j - 1])
+        return out
+
+    def _find_hold(self) -> tuple[int, int]:
+        """A speed that changes in every k-th row only: k and the row, counted from the log's first."""
+        if self.speed is None:
+            return 1, 0
+        changed = np.diff(self.speed) != 0
+        rows = (self.source // self.group)[1:]
+        for k in range(10, 1, -1):
+            counts = np.bincount(rows[changed] % k, minlength=k)
+            if counts.max() > 0.98 * counts.sum() and counts.sum() > 30:
+                return k, int(counts.argmax())
+        return 1, 0
+
+    def _grid(self) -> Grid:
+        steps = np.diff(self.time)
+        last = np.zeros(len(self.time), bool)
+        last[self.bounds[1:] - 1] = True
+        parts = np.where(last, 1, (np.append(steps, 1.0) / GRID_S).astype(np.int64) + 1)
+        row = np.repeat(np.arange(len(self.time)), parts)
+        within = np.arange(len(row)) - np.repeat(np.cumsum(parts) - parts, parts)
+        share = within / parts[row]
+        later = np.minimum(row + 1, len(self.time) - 1)
+        time = self.time[row] + share * (self.time[later] - self.time[row])
+        speed = self.smooth_speed[row] + share * (self.smooth_speed[later] - self.smooth_speed[row])
+        starts = self.starts[row] & (within == 0)
+        accel0 = np.zeros(len(row))
+        accel0[starts] = [self._first_accel(i) for i in self.bounds[:-1]]
+        return Grid(time, row, speed, starts, accel0)
+
+    def _first_accel(self, row: int) -> float:
+        w = max(3, int(_START_S / self.dt))
+        if self.accel is not None:
+            return float(self.accel[row : row + w].mean())
+        v, t = self.smooth_speed, self.time
+        return float((v[row + w] - v[row]) / (t[row + w] - t[row]))
+
+
+def _same_kind(logs: Sequence[Log]) -> None:
+    if not logs:
+        raise InputError("logs: none given, needs one or more")
+    names = ", ".join(dict.fromkeys(log.name for log in logs))
+    for log in logs:
+        if log.accel_cmd is None:
+            raise no_command(log, ", which the diagnosis needs")
+    if len({(log.accel is not None, log.speed is not None) for log in logs}) > 1:
+        raise InputError(f"logs: {names} have different channels; needs accel, speed or both in all")
+    if len({log.accel_kind for log in logs}) > 1:
+        raise InputError(f"logs: {names} have different kinds of accel; needs one in all")
+    rates = [log.rate_hz for log in logs]
+    if max(rates) > 1.02 * min(rates):
+        given = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in logs)
+        raise InputError(f"logs: found rates of {given}; needs one rate in all, or one diagnosis each")
+
+
+def _stretches(log: Log) -> list[slice]:
+    """Rows in which the car moves and obeys the command, without a gap. The speed is smoothed: its noise is no stop."""
+    out = []
+    for part in log.engaged_segments():
+        moves = log.moving[part]
+        if log.speed is not None:
+            smooth = gaussian_filter1d(log.speed[part], _SMOOTH_S * log.rate_hz, mode="nearest")
+            moves = smooth > STANDSTILL_MPS
+        change = np.flatnonzero(np.diff(moves.astype(int), prepend=0, append=0)).tolist()
+        out += [slice(part.start + i, part.start + j) for i, j in zip(change[::2], change[1::2], strict=True)]
+    return out
+
+
+def _smooth_speed(
+    time: FloatArray, accel: FloatArray | None, speed: FloatArray | None, bounds: IntArray, dt: float
+) -> FloatArray:
+    """The speed beside the integral of the acceleration, smoothed: corners stay sharp. 15 m/s where none was
+    measured."""
+    if speed is None:
+        return np.full(len(time), 15.0)
+    out = np.empty_like(speed)
+    for i, j in itertools.pairwise(bounds):
+        c = np.zeros(j - i)
+        if accel is not None:
+            c[1:] = np.cumsum(0.5 * (accel[i + 1 : j] + accel[i : j - 1]) * np.diff(time[i:j]))
+        out[i:j] = gaussian_filter1d(speed[i:j] - c, _SMOOTH_S / dt) + c
+    return out
+
+
+def _dct4(x: FloatArray) -> FloatArray:
+    """The orthonormal cosine transform of type IV of each row."""
+    return np.asarray(dct(x, type=4, norm="ortho", axis=1))
+
+
+def _even(rows: int) -> int:
+    """The largest even number of rows up to `rows` that the transform is fast at."""
+    for k in range(rows, rows // 2, -1):
+        rest = k
+        for f in (2, 3, 5):
+            while rest % f == 0:
+                rest //= f
+        if k % 2 == 0 and rest == 1:
+            return k
+    return rows - rows % 2

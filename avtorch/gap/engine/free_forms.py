@@ -1,0 +1,405 @@
+r"""What no named effect explains: free forms of a family, linear in their coefficients, beside a set of named effects.
+
+    R = J delta + sum_j beta_j z_j + n,     beta ~ N(0, sd^2),     delta ~ the engine's priors,
+
+R is the residual of a hypothesis in lapped coefficients, J its Jacobian, so that every named parameter may move again,
+and z_j the response of all channels to a demand of a form: other lags (dynamics), other lags by sign, hinges of the
+command times hats of the speed (force map), a sine (tone), a gain or a delay that wanders as an Ornstein-Uhlenbeck
+process over the frames. The noise's covariance stays free in every band, as in `likelihood`; coefficients are
+integrated out by Laplace's approximation. A form's gain is the lesser of that below `CLAIM_HZ` and that of all bands,
+as everywhere: a closed loop's echoes cancel over the whole band only (Ljung 1999, section 13.4).
+
+The mirrored bank, whose lags run backwards in time, is a negative control for linear dynamics: no car answers before
+the command, but a loop that answers the noise of sensors does, as a recorder shows it (negative
+controls: Lipsitch, Tchetgen Tchetgen and Cohen 2010).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from scipy.linalg import cho_factor, cho_solve
+from scipy.ndimage import median_filter
+
+from avtorch.arrays import BoolArray, FloatArray
+from avtorch.gap.engine.coordinates import INDEX
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.gauss_newton import prior_terms
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.likelihood import claimed, log_likelihood, whiten
+
+COEFFICIENT_SD = 0.35
+"""Prior sd of a form's coefficient [of the demand; a tone's: m/s^2]: a third of what the command asks for."""
+LAG_RATIOS = (0.3, 1.0, 3.0, 10.0)
+"""Lags of a linear bank over the car's own [-]: half a decade apart, and twice that at the slow end."""
+SHORTEST_LAG_S = 0.03
+"""Shortest lag of a bank [s]; what is faster belongs to the recorder."""
+SPEED_QUANTILES = (0.02, 0.35, 0.65, 0.98)
+"""Knots of the force map along the speed: the ends of what was driven, and its thirds."""
+SPEED_SPAN_MPS = 2.0
+"""Least distance [m/s] of the outer knots at which a dependence on speed is a question at all."""
+HINGE_QUANTILES = (0.6, 0.9)
+"""Hinges of the force map on each side of the command: at these quantiles of what was asked for."""
+IDLE_MPS2 = 0.02
+"""Demand [m/s^2] below which nothing is asked for; a hundredth of a brisk one."""
+WANDER_SD = {"gain": 0.2, "delay": 0.12}
+"""Typical sd of a wandering gain [-] and of a wandering delay [s]."""
+WANDER_RATIOS = (0.3, 1.0, 2.0)
+"""Sizes over the typical one [-] that are tried: weaker ones are not seen, larger ones are no wandering any more."""
+WANDER_S = (12.0, 30.0, 80.0)
+"""Correlation times [s] of what wanders: longer than a frame, shorter than a drive."""
+TONE_HZ = 3.0
+"""Tones are searched for below [Hz]: swinging loops and controllers, not the engine or the wheels."""
+TONE_BACKGROUND_HZ = 0.25
+"""Width [Hz] of the running median that is the noise around a line, at least 15 bins of the spectrum."""
+_LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
+_DELAY_STEP_S = 0.02  # of the finite difference in a delay: about the typical wandering
+
+
+@dataclass(frozen=True, eq=False)
+class FreeForm:
+    """A linear family: `columns` (column, channel, frame, bin) are the responses to its demands of coefficient one.
+
+    `family`: where it acts ("force map", "dynamics", "time", "recorder"); `terms` (column,): each demand in words.
+    """
+
+    name: str
+    family: str
+    columns: FloatArray = field(repr=False)
+    terms: tuple[str, ...] = field(repr=False)
+
+
+class FreeFormFit(NamedTuple):
+    """Evidence of a free form beside a hypothesis.
+
+    `nats` over the hypothesis without it; `residual` (channel, frame, bin) that is left, None where nothing can be
+    told; `coefficients` (column,) of the form, or the course (frame,) of what wanders.
+    """
+
+    nats: float
+    residual: FloatArray | None
+    coefficients: FloatArray
+
+
+class Tone(NamedTuple):
+    """A steady line: its fit, its frequency [Hz] and the channel that shows it best."""
+
+    fit: FreeFormFit
+    frequency: float
+    channel: str
+
+
+def families(h: Hypothesis) -> dict[str, FreeForm]:
+    """The free forms of dynamics ("linear", "sided") and of the force map ("map", where the speed is known)."""
+    u = h["K_L"] * h.command()
+    short, own, long, longest = _bank(h)
+    rate = own * np.diff(u, prepend=u[:1]) / h.data.dt  # a lead as long as the lag, in m/s^2
+    rate[h.data.starts] = 0.0
+    up = np.maximum(u, 0.0)
+    demands: dict[tuple[str, str], list[tuple[str, FloatArray, float]]] = {
+        ("linear", "dynamics"): [*(("u", u, lag) for lag in (short, long, longest)), ("slope of u", rate, own)],
+        ("sided", "dynamics"): [("u > 0", up, lag) for lag in (short, long, longest, own)],
+        ("map", "force map"): [(term, w, own) for term, w in _map_demands(h.data, u)],
+    }
+    return {name: _form(h, name, family, each) for (name, family), each in demands.items() if each}
+
+
+def mirror_columns(h: Hypothesis) -> FreeForm:
+    """The linear bank run backwards in time: the answer to a command before it was given."""
+    lags = np.array(_bank(h))
+    demands = np.tile(h["K_L"] * h.command(), (len(lags), 1))
+    columns = demand_response(h, demands, lags, backwards=True)
+    return FreeForm("mirror", "recorder", columns, tuple(f"lag -{lag:.2f} s" for lag in lags))
+
+
+def block(h: Hypothesis, form: FreeForm, sd: float = COEFFICIENT_SD, iterations: int = 4) -> FreeFormFit:
+    """Evidence of a linear form beside `h`, whose parameters may move again.
+
+    `h`: with its evidence evaluated (`jacobian`, `information`). `sd`: of the prior on each coefficient. `iterations`:
+    alternations between coefficients and noise; the best is the answer.
+    """
+    names = h.free
+    precision, pull = prior_terms(h, names)
+    products = band_products(h.data, np.concatenate([h.residual[None], np.asarray(h.jacobian), form.columns]))
+    without, _ = _linear_evidence(h, products[..., : 1 + len(names), : 1 + len(names)], precision, pull, 2)
+    without = max(without, -0.5 * float(np.linalg.slogdet(h.information)[1]))
+    count = len(form.columns)
+    precision = np.concatenate([precision, np.full(count, sd**-2)])
+    pull = np.concatenate([pull, np.zeros(count)])
+    value, moves = _linear_evidence(h, products, precision, pull, iterations)
+    value -= count * math.log(sd)
+    taken = np.tensordot(moves[: len(names)], h.jacobian, 1) + np.tensordot(moves[len(names) :], form.columns, 1)
+    return FreeFormFit(value - without, h.residual - taken, moves[len(names) :])
+
+
+def wandering(h: Hypothesis) -> dict[str, FreeFormFit]:
+    """A gain or a delay that wanders from frame to frame: the best Ornstein-Uhlenbeck course of a grid over none.
+
+    The course has no mean: what is constant belongs to the car's or the recorder's own gain and delay, with their
+    priors. Every grid point is as likely as any other, so the best of them costs the logarithm of their number.
+    """
+    return {kind: _wandering(h, response, WANDER_SD[kind]) for kind, response in _wandering_responses(h).items()}
+
+
+def tone(h: Hypothesis, fmin: float = 0.1) -> Tone:
+    """The steadiest line between `fmin` and `TONE_HZ` in what is left: a sine of every channel beside the hypothesis.
+
+    The line is found on the spectrum of the longest stretch, over a running median; its evidence is that of any other
+    form, less the logarithm of the number of frequencies that were looked at. A peak over its background is no
+    evidence: it grows with the length of the log.
+    """
+    data = h.data
+    frequency, channel, tried = _strongest_line(h, fmin)
+    if not tried:
+        return Tone(FreeFormFit(0.0, None, np.zeros(2 * data.channel_count)), 0.0, "")
+    angle = 2.0 * math.pi * frequency * (data.time - data.time[0])
+    waves = data.transform([np.cos(angle), np.sin(angle)])
+    columns = np.zeros((data.channel_count, 2, data.channel_count, *waves.shape[1:]))
+    for c in range(data.channel_count):
+        columns[c, :, c] = waves
+    terms = tuple(f"{name}, {wave}" for name in data.channels for wave in ("cosine", "sine"))
+    fit = block(h, FreeForm("tone", "time", columns.reshape(-1, *columns.shape[2:]), terms))
+    return Tone(fit._replace(nats=fit.nats - math.log(tried)), frequency, data.channels[channel])
+
+
+def demand_response(h: Hypothesis, demands: FloatArray, lags: FloatArray, *, backwards: bool = False) -> FloatArray:
+    """Responses (column, channel, frame, bin) to additional demands (column, row) [m/s^2] behind lags (column,) [s].
+
+    Demands are held between rows. Each passes the hypothesis's dead time and its recorder. `backwards`: the lags run
+    backwards in time, and there is no dead time: what would answer a demand before it is given.
+    """
+    data, grid = h.data, h.data.grid
+    seen = h.values.copy()
+    if not backwards and "dead_time" not in h.onsets:
+        for channel in data.channels:
+            seen[INDEX[f"{channel}_delay"]] += h["dead_time"]
+    rows = []
+    for demand, lag in zip(demands, lags, strict=True):
+        held = demand[grid.row]
+        if backwards:
+            accel, gained = _first_order_backwards(grid.time, grid.starts, held, float(lag))
+        else:
+            accel, gained = first_order(grid.time, grid.starts, held, float(lag))
+        rows += h.recorded(accel, gained, seen)
+    return data.transform(rows).reshape(len(demands), *h.predicted.shape)
+
+
+@njit(cache=True, fastmath=True)
+def first_order(  # pragma: no cover - compiled
+    time: FloatArray, starts: BoolArray, demand: FloatArray, lag: float
+) -> tuple[FloatArray, FloatArray]:
+    """Acceleration (row,) of a lag [s] behind a held `demand` (row,), and its integral (row,), from rest at it.
+
+    Each of `starts` (row,) begins anew: at the demand's own value, and with an integral of 0.
+    """
+    n = len(time)
+    accel, speed = np.empty(n), np.empty(n)
+    a, gained, last, keep = 0.0, 0.0, -1.0, 0.0
+    for i in range(n):
+        if i == 0 or starts[i]:
+            a, gained = demand[i], 0.0
+        accel[i], speed[i] = a, gained
+        if i + 1 < n and not starts[i + 1]:
+            step = time[i + 1] - time[i]
+            if abs(step - last) > 1e-9:  # rows are even but for their rounding
+                keep = math.exp(-step / lag)
+                last = step
+            after = demand[i] + keep * (a - demand[i])
+            gained += step * demand[i] - lag * (after - a)
+            a = after
+    return accel, speed
+
+
+def band_products(data: DriveData, x: FloatArray) -> FloatArray:
+    """Inner products (band, channel, channel, signal, signal) over frames and bins of x (signal, channel, frame, bin).
+
+    With them, whitened inner products under any noise, and the residual's covariance for any coefficients, cost no
+    pass over the coefficients of the drive.
+    """
+    count, channels = x.shape[:2]
+    out = np.empty((data.band_count, channels, channels, count, count))
+    for band, (low, high) in enumerate(zip(data.band_edges[:-1], data.band_edges[1:], strict=True)):
+        part = np.ascontiguousarray(x[..., low:high]).reshape(count * channels, -1)
+        out[band] = (part @ part.T).reshape(count, channels, count, channels).transpose(1, 3, 0, 2)
+    return out
+
+
+def _linear_evidence(
+    h: Hypothesis, products: FloatArray, precision: FloatArray, pull: FloatArray, iterations: int
+) -> tuple[float, FloatArray]:
+    """Gain [nats] of signals 1, 2, ... of `products` in explaining signal 0, and their coefficients.
+
+    Coefficients have the prior exp(pull' b - b' diag(precision) b / 2), whose own normalisation is left out. The gain
+    contains that of the likelihood over `h`, the prior's change, and -1/2 log det of the posterior's precision.
+    """
+    data, noise = h.data, h.covariance
+    before = claimed(data, noise), h.log_likelihood
+    best, at = -math.inf, np.zeros(len(precision))
+    for _ in range(iterations):
+        weighted = np.tensordot(np.linalg.inv(noise), products, 3)
+        information = weighted[1:, 1:] + np.diag(precision)
+        factor = cho_factor(information)
+        moves = cho_solve(factor, weighted[1:, 0] + pull)
+        left = np.concatenate([[1.0], -moves])
+        noise = (products @ left) @ left / data.band_size[:, None, None]
+        noise += _LEAST * np.trace(noise, axis1=1, axis2=2)[:, None, None] * np.eye(data.channel_count)
+        gain = min(claimed(data, noise) - before[0], claimed(data, noise, math.inf) - before[1])
+        gain += float(pull @ moves - 0.5 * precision @ moves**2) - float(np.log(np.diag(factor[0])).sum())
+        if gain > best:
+            best, at = gain, moves
+    return best, at
+
+
+def _bank(h: Hypothesis) -> tuple[float, ...]:
+    """Lags [s] of a linear bank around the car's own, in the order of `LAG_RATIOS`."""
+    return tuple(max(h["T_L"] * ratio, SHORTEST_LAG_S) for ratio in LAG_RATIOS)
+
+
+def _form(h: Hypothesis, name: str, family: str, demands: Sequence[tuple[str, FloatArray, float]]) -> FreeForm:
+    """A form from its demands: what each is, its rows (row,), and the lag [s] behind it."""
+    columns = demand_response(h, np.array([w for _, w, _ in demands]), np.array([lag for *_, lag in demands]))
+    return FreeForm(name, family, columns, tuple(f"{term}, lag {lag:.2f} s" for term, _, lag in demands))
+
+
+def _map_demands(data: DriveData, u: FloatArray) -> list[tuple[str, FloatArray]]:
+    """Demands of the force map: each side of the command times hats of the speed, and hinges on each side."""
+    if data.speed is None:
+        return []
+    knots = np.quantile(data.smooth_speed, SPEED_QUANTILES)
+    demands = []
+    for side, sign in (("u > 0", 1.0), ("u < 0", -1.0)):
+        size = np.maximum(sign * u, 0.0)
+        if knots[-1] - knots[0] > SPEED_SPAN_MPS:
+            hats = (np.interp(data.smooth_speed, knots, unit) for unit in np.eye(len(knots)))
+            demands += [(f"{side}, {v:.1f} m/s", sign * size * hat) for v, hat in zip(knots, hats, strict=True)]
+        asked = size[size > IDLE_MPS2]
+        for at in np.quantile(asked, HINGE_QUANTILES) if len(asked) else ():
+            demands.append((f"{side}, beyond {sign * at:.2f} m/s^2", sign * np.maximum(size - at, 0.0)))
+    return demands
+
+
+def _first_order_backwards(
+    time: FloatArray, starts: BoolArray, demand: FloatArray, lag: float
+) -> tuple[FloatArray, FloatArray]:
+    """`first_order` in time that runs backwards, from the end of each stretch; its integral up to a constant."""
+    ends = np.append(starts[1:], True)
+    held = np.where(starts, demand, np.append(demand[:1], demand[:-1]))  # before each point, as time is turned around
+    accel, gained = first_order(-time[::-1], ends[::-1].copy(), held[::-1].copy(), lag)
+    return accel[::-1].copy(), -gained[::-1]
+
+
+def _wandering_responses(h: Hypothesis) -> dict[str, FloatArray]:
+    """Derivative (channel, frame, bin) of the response by the logarithm of its gain and by a delay of all channels."""
+    late, early = h.values.copy(), h.values.copy()
+    for channel in h.data.channels:
+        late[INDEX[f"{channel}_delay"]] += _DELAY_STEP_S
+        early[INDEX[f"{channel}_delay"]] -= _DELAY_STEP_S
+    signals = h.on_grid()
+    change = h.data.transform(h.recorded(*signals, late)) - h.data.transform(h.recorded(*signals, early))
+    return {"gain": h.predicted, "delay": change / (2.0 * _DELAY_STEP_S)}
+
+
+def _wandering(h: Hypothesis, response: FloatArray, sd: float, iterations: int = 3) -> FreeFormFit:
+    """Evidence of a course times `response` (channel, frame, bin) beside `h`, whose parameters may move again.
+
+    What wanders is noise at first; once it is out, the noise is smaller: both are found in turn. The noise is larger in
+    frames that still show more of it where the response is, so that one such frame is no wandering.
+    """
+    data = h.data
+    frames = data.frame_count
+    precision, pull = prior_terms(h, h.free)
+    between = np.abs(data.frame_time[:, None] - data.frame_time)
+    centre = np.eye(frames) - 1.0 / frames
+    priors = [centre @ ((ratio * sd) ** 2 * np.exp(-between / s)) @ centre for ratio in WANDER_RATIOS for s in WANDER_S]
+
+    def by_frame(x: FloatArray, noise: FloatArray) -> FloatArray:
+        shape = data.channel_count, frames, data.bin_count
+        return np.moveaxis(whiten(data, noise, x).reshape(shape), 1, 0).reshape(frames, -1)
+
+    noise, left = h.covariance, h.residual
+    best = FreeFormFit(-math.inf, None, np.zeros(frames))
+    for _ in range(iterations):
+        w, r, remaining = (by_frame(x, noise) for x in (response, h.residual, left))
+        energy = (w * w).sum(1)
+        scale = np.sqrt(np.maximum((w * w * remaining**2).sum(1) / np.maximum(energy, 1e-12), 1.0))[:, None]
+        w, r = w / scale, r / scale
+        jacobian = np.array([by_frame(j, noise) / scale for j in h.jacobian])
+        shared = np.einsum("fk,pfk->pf", w, jacobian)
+        flat = jacobian.reshape(len(jacobian), -1)
+        taken = np.linalg.solve(flat @ flat.T + np.diag(precision), np.c_[shared, flat @ r.ravel() + pull])
+        information = np.diag((w * w).sum(1)) - shared.T @ taken[:, :-1]
+        score = (w * r).sum(1) - shared.T @ taken[:, -1]
+        course, occam = _best_course(score, 0.5 * (information + information.T), priors)
+        moves = taken[:, -1] - taken[:, :-1] @ course
+        left = h.residual - response * course[:, None] - np.einsum("p,pcfk->cfk", moves, h.jacobian)
+        total, after = log_likelihood(data, left)
+        gain = min(claimed(data, after) - claimed(data, h.covariance), total - h.log_likelihood)
+        gain += float(pull @ moves - 0.5 * precision @ moves**2) + occam - math.log(len(priors))
+        if gain > best.nats:
+            best = FreeFormFit(gain, left, course)
+        change = np.log(np.trace(after, axis1=1, axis2=2) / np.trace(noise, axis1=1, axis2=2))
+        if np.abs(change).max() < 0.05:  # of a band's variance: no nat in twenty coefficients
+            break
+        noise = after
+    return best
+
+
+def _best_course(score: FloatArray, information: FloatArray, priors: Sequence[FloatArray]) -> tuple[FloatArray, float]:
+    """The posterior mean (frame,) under the prior covariance of most evidence, and what that prior costs [nats].
+
+    The cost is -m' K^-1 m / 2 - log det(1 + K P) / 2. With m = K (score - P m), it needs no inverse of K, which is
+    singular without a mean.
+    """
+    best, course, cost = -math.inf, np.zeros(len(score)), 0.0
+    unit = np.eye(len(score))
+    for prior in priors:
+        system = unit + prior @ information
+        mean = np.asarray(np.linalg.solve(system, prior @ score), float)
+        half_log_det = 0.5 * float(np.linalg.slogdet(system)[1])
+        evidence = 0.5 * float(score @ mean) - half_log_det
+        if evidence > best:
+            best = evidence
+            course, cost = mean, -0.5 * float(mean @ (score - information @ mean)) - half_log_det
+    return course, cost
+
+
+def _strongest_line(h: Hypothesis, fmin: float) -> tuple[float, int, int]:
+    """Frequency [Hz] and channel of the spectral line that stands out most, and how many bins were looked at."""
+    data = h.data
+    longest = int(np.argmax(np.diff(data.bounds)))
+    rows = slice(data.bounds[longest] + data.warm_rows, data.bounds[longest + 1])
+    measured = data.channel_rows(data.accel, data.speed)
+    fmax = min(TONE_HZ, float(data.frequency[-1]))  # of the coefficients that count
+    best, line = -math.inf, (0.0, 0, 0)
+    for channel, (y, x) in enumerate(zip(measured, h.rows(), strict=True)):
+        error = (y - x)[rows]
+        frequency = np.fft.rfftfreq(len(error), data.dt)
+        step = float(frequency[1])
+        power = np.abs(np.fft.rfft((error - error.mean()) * np.hanning(len(error)))) ** 2
+        near = frequency < fmax + TONE_BACKGROUND_HZ
+        frequency, power = frequency[near], power[near]
+        looked = (frequency > fmin) & (frequency < fmax)
+        width = int(max(15, TONE_BACKGROUND_HZ / step)) | 1
+        tried = int(looked.sum())
+        if tried < width:
+            continue
+        # the median of an exponential law is log 2 of its mean
+        background = median_filter(power, width, mode="nearest") / math.log(2.0) + 1e-30
+        excess = np.where(looked, power / background, 0.0)
+        k = int(np.argmax(excess))
+        if excess[k] - math.log(tried) > best:
+            best = float(excess[k]) - math.log(tried)
+            line = float(frequency[k]) + step * _between_bins(power[k - 1 : k + 2]), channel, tried
+    return line
+
+
+def _between_bins(power: FloatArray) -> float:
+    """Where a line lies beside the middle one of three bins of its power under Hann's window [bins]."""
+    below, at, above = np.sqrt(power)
+    shift = (2.0 * above - at) / (at + above) if above > below else (at - 2.0 * below) / (below + at)
+    return float(np.clip(shift, -1.0, 1.0))

@@ -1,0 +1,154 @@
+"""Gauss-Newton under a noise that is integrated out: weighted least squares with the noise of the last step.
+
+Nuisance priors are rows of their own in every least squares, so that a recorder stretched to its limits pulls back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from avtorch.arrays import FloatArray
+from avtorch.gap.engine.coordinates import COORDINATES, INDEX
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.likelihood import whiten
+from avtorch.gap.engine.priors import RECORDER_DELAY_S, RECORDER_FILTER_S
+
+_RECORDER = {
+    f"{channel}_{what}": prior[channel]
+    for what, prior in (("delay", RECORDER_DELAY_S), ("filter", RECORDER_FILTER_S))
+    for channel in ("accel", "speed")
+}
+_STEPS = {"T_L": 0.01, "K_L": 0.005} | dict.fromkeys(_RECORDER, 0.004)  # of finite differences
+_BASE = {"T_L": (math.log(0.3), 1.5), "K_L": (1.0, 0.5)}  # wide: only a fit without information feels them
+_WIDE = 4.0  # a fit's normal prior of a size, over the scale of its Student prior
+
+
+def normal_prior(name: str, neutral: float) -> tuple[float, float]:
+    """Mean and standard deviation of the normal prior under which a coordinate is fitted (T_L: of its logarithm)."""
+    if name in _BASE:
+        return _BASE[name]
+    if name in _RECORDER:
+        return _RECORDER[name]
+    c = COORDINATES[name]
+    return (neutral, _WIDE * c.scale) if c.mean is None else (c.mean, c.scale)
+
+
+def prior_terms(h: Hypothesis, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+    """Precision and pull (parameter,) of the normal priors at the hypothesis's values."""
+    precision, pull = np.zeros(len(names)), np.zeros(len(names))
+    for k, name in enumerate(names):
+        x = h[name]
+        mean, sd = normal_prior(name, h.neutral[INDEX[name]])
+        if name == "T_L":
+            precision[k] = x**-2
+            pull[k] = -(math.log(x) - mean) / (sd * sd * x)
+        else:
+            precision[k] = sd**-2
+            pull[k] = (mean - x) / (sd * sd)
+    return precision, pull
+
+
+def penalty(h: Hypothesis, names: Sequence[str]) -> float:
+    """Log density of the normal priors, without constants [nats]."""
+    total = 0.0
+    for name in names:
+        mean, sd = normal_prior(name, h.neutral[INDEX[name]])
+        x = math.log(h[name]) if name == "T_L" else h[name]
+        total -= 0.5 * ((x - mean) / sd) ** 2
+    return total
+
+
+def objective(h: Hypothesis) -> float:
+    """What a fit maximises [nats]: log likelihood of the whole band and normal priors."""
+    return h.log_likelihood + penalty(h, h.free)
+
+
+def jacobian(h: Hypothesis, names: Sequence[str]) -> FloatArray:
+    """Derivatives (parameter, channel, frame, bin) of an evaluated hypothesis's response."""
+    onsets = h.onset_vector()
+    out = np.empty((len(names), *h.predicted.shape))
+    signals = None
+    for k, name in enumerate(names):
+        step = 0.02 * h["T_L"] if name == "T_L" else _STEPS.get(name) or COORDINATES[name].step
+        i = INDEX[name]
+        p = h.values.copy()
+        if name in _RECORDER:  # the car moves as before, only its recorder differs
+            if signals is None:
+                signals = h.on_grid()
+            low = p.copy()
+            p[i] += step
+            if name.endswith("_delay"):
+                low[i] -= step
+            ahead = h.data.transform(h.recorded(*signals, p))
+            behind = h.predicted if low[i] == h.values[i] else h.data.transform(h.recorded(*signals, low))
+            out[k] = (ahead - behind) / (p[i] - low[i])
+            continue
+        if p[i] + step > h.limits(name)[1]:
+            step = -step
+        p[i] += step
+        out[k] = (h.response(p, onsets) - h.predicted) / step
+    return out
+
+
+def whitened_jacobian(h: Hypothesis, derivatives: FloatArray) -> FloatArray:
+    """Derivatives in units of the noise, (parameter, coefficient)."""
+    return np.array([whiten(h.data, h.covariance, j) for j in derivatives])
+
+
+def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05, names: Sequence[str] | None = None) -> Hypothesis:
+    """The hypothesis at the maximum of `objective`, changed in place and returned.
+
+    Steps are halved by damping until they gain; a coordinate that would leave its limits stays there and the others are
+    solved again. Stops where a step gains less than `tolerance` [nats].
+    """
+    names = h.free if names is None else list(names)
+    at = [INDEX[n] for n in names]
+    low, high = np.array([h.limits(n) for n in names]).T
+    h.evaluate()
+    current, damping = h.log_likelihood + penalty(h, names), 1e-3
+    for _ in range(iterations):
+        W = whitened_jacobian(h, jacobian(h, names))
+        precision, pull = prior_terms(h, names)
+        H = W @ W.T
+        g = W @ whiten(h.data, h.covariance, h.residual) + pull
+        better = None
+        for _ in range(5):
+            A = H + np.diag(precision + damping * np.diag(H) + 1e-12)
+            new = h.copy()
+            new.values[at] = _within(A, g, h.values[at], low, high)
+            new["T_L"] = min(max(new["T_L"], 0.4 * h["T_L"]), 2.5 * h["T_L"])
+            new.evaluate()
+            value = new.log_likelihood + penalty(new, names)
+            if value > current - 1e-9:
+                better = new
+                break
+            damping = max(damping * 8, 1e-2)
+        if better is None:
+            break
+        gain, current = value - current, value
+        h.values, h.predicted, h.residual = better.values, better.predicted, better.residual
+        h.covariance, h.log_likelihood = better.covariance, better.log_likelihood
+        damping = max(damping / 10, 1e-5)
+        if gain < tolerance:
+            break
+    return h
+
+
+def _within(A: FloatArray, g: FloatArray, x: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """`x` plus the step that solves `A step = g`, within limits: what would leave them is fixed, the rest solved
+    again."""
+    step = np.linalg.solve(A, g)
+    fixed = np.zeros(len(x), bool)
+    for _ in range(3):
+        beyond = ((x + step < low) | (x + step > high)) & ~fixed
+        if not beyond.any():
+            break
+        fixed |= beyond
+        step[beyond] = np.clip(x[beyond] + step[beyond], low[beyond], high[beyond]) - x[beyond]
+        free = ~fixed
+        if free.any():
+            step[free] = np.linalg.solve(A[np.ix_(free, free)], g[free] - A[np.ix_(free, fixed)] @ step[fixed])
+    return np.clip(x + step, low, high)

@@ -1,0 +1,444 @@
+r"""Gear shifts: speeds at which driving upwards is interrupted, found by matched filter.
+
+Where the speed rises through a level g, a positive demand loses the share `depth` for a time. Of all upshifts through a
+level the demand changes by -depth p_g, p_g (row,) being the demand times the share of each row that lies in an
+interruption. With score s and information A of `demand_filter`, and with the other parameters free under their priors
+(derivatives J, precision N = J' S^-1 J + Lambda),
+
+    gain of a level = -depth s~' p_g - 1/2 depth² p_g' A~ p_g,    A~ = A - Z' N^-1 Z,   Z = scores of J's columns,
+
+s~ being the score that is left when those parameters have taken what they can (Frisch, Waugh and Lovell). Levels are
+added one by one, each with its own depth (matching pursuit; Mallat and Zhang 1993); `refined_shift_speeds` moves, drops
+and adds them under one common depth, level by level (coordinate ascent), and tries every distinct re-arming hysteresis.
+The response is simulated only to accept the outcome.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from avtorch.arrays import BoolArray, FloatArray, IntArray
+from avtorch.gap.engine.compiled_plant import GRID_S
+from avtorch.gap.engine.coordinates import INDEX, NEUTRAL
+from avtorch.gap.engine.demand_filter import (
+    coordinate_from_start,
+    demand_information,
+    demand_score,
+    frame_cover,
+    information_of_coefficients,
+    take_out,
+)
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.gauss_newton import fit, jacobian, prior_terms
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.priors import SHIFT_NATS, WARM_S
+
+LEVEL_STEP_MPS = 0.1
+"""Distance of candidate speeds [m/s]: passed within a tenth of a second at 1 m/s², short against any interruption."""
+LOWEST_MPS = 2.0
+"""Lowest speed [m/s] of an upshift: below, first gears slip their clutch."""
+LEAST_RATIO = 1.15
+"""Least ratio of neighbouring shift speeds [-]: the closest steps of car gearboxes (Naunheimer et al. 2011, ch. 4)."""
+DURATIONS_S = (0.2, 0.35, 0.6, 1.0)
+"""Interruptions that are tried [s], dual clutch to automated truck gearbox; a matched filter is broad in its length."""
+CAUSES_BEFORE_S, CAUSES_AFTER_S = 1.5, 2.0
+"""Around an upshift a residual may be the shift's [s]: behind it the longest interruption with its lag, before it an
+early crossing where the shift speed is some tenths of a metre per second too high."""
+
+_MOST_LEVELS = 16  # as `effects.gear_shift` has it
+_PASSES = 3  # of levels given parameters, parameters given levels
+_NEAR_MPS = 0.6  # how far a level moves at once
+_FINE_MPS = 0.02  # resolution of its place
+_DISTINCT_MPS = 0.05  # smaller dips of the speed are noise
+
+
+def shift_speeds(h: Hypothesis) -> tuple[FloatArray, float]:
+    """Speeds (gear,) [m/s], rising, at which upshifts interrupt the drive, and what they gain in all [nats].
+
+    `h` has been evaluated, without gear shifts. Each speed has paid `SHIFT_NATS`.
+    """
+    data = h.data
+    best: tuple[FloatArray, float] = (np.zeros(0), 0.0)
+    levels = _levels(data)
+    if data.speed is None or not len(levels):
+        return best
+    likelihood = _PulseLikelihood.of(h, h.residual)
+    upshifts = [likelihood.upshifts(g, h["shift_hysteresis"]) for g in levels]
+    for duration in DURATIONS_S:
+        pulses = [likelihood.pulses(times, duration) for times in upshifts]
+        sizes = [likelihood.size(p) for p in pulses]
+        found, nats = _pursued(likelihood, levels, pulses, sizes)
+        if nats > best[1]:
+            best = (found, nats)
+    return best
+
+
+def refined_shift_speeds(h: Hypothesis) -> Hypothesis:
+    """The hypothesis, which has `gear_shift`, with its speeds, depth and hysteresis refined, fitted; `h` where nothing
+    gains."""
+    best = h
+    for _ in range(_PASSES):
+        values = best.values.copy()
+        values[INDEX["shift_depth"]] = 0.0
+        likelihood = _PulseLikelihood.of(best, best.data.measured - best.response(values))
+        levels, hysteresis, depth = _ascended(
+            likelihood, best.shift_speeds, best["shift_hysteresis"], best["shift_depth"], best["shift_duration"]
+        )
+        same = np.array_equal(levels, best.shift_speeds) and hysteresis == best["shift_hysteresis"]
+        if not len(levels) or same:
+            break
+        new = best.copy()
+        new.shift_speeds = levels
+        new["shift_hysteresis"], new["shift_depth"] = hysteresis, depth
+        fit(new, 4)
+        if _objective(new) <= _objective(best) + 0.5:
+            break
+        best = new
+    return best
+
+
+def upshift_rows(data: DriveData, speeds: FloatArray) -> BoolArray:
+    """Rows (row,) around upshifts through any of `speeds` [m/s], whose residual may be theirs."""
+    out = np.zeros(len(data.time), bool)
+    hysteresis = float(NEUTRAL[INDEX["shift_hysteresis"]])
+    for g in speeds:
+        for t in upshift_times(data.time, data.smooth_speed, data.starts, float(g), hysteresis):
+            i, j = np.searchsorted(data.time, (t - CAUSES_BEFORE_S, t + CAUSES_AFTER_S))
+            out[i:j] = True
+    return out
+
+
+def _objective(h: Hypothesis) -> float:
+    return h.log_likelihood - SHIFT_NATS * len(h.shift_speeds)
+
+
+def _levels(data: DriveData) -> FloatArray:
+    v = data.smooth_speed
+    return np.arange(max(LOWEST_MPS, math.ceil(10 * v.min()) / 10), v.max(), LEVEL_STEP_MPS)
+
+
+def _apart(levels: FloatArray, others: FloatArray) -> BoolArray:
+    """Which `levels` (level,) are no neighbour of any of `others`."""
+    ratio = np.abs(np.log(levels[:, None] / np.asarray(others)[None, :]))
+    return np.all(ratio >= math.log(LEAST_RATIO), axis=1)
+
+
+# interruptions as pulses of the demand -------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class _Pulses:
+    """Interruptions of full depth: `first` (upshift,) rows and `values` (upshift, row) [m/s²], 0 behind their end."""
+
+    first: IntArray
+    values: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Size:
+    """`own` p' A~ p of pulses p, and `others` N^-1 Z p (parameter,): what the other parameters take of them."""
+
+    own: float
+    others: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _PulseLikelihood:
+    """log L as a quadratic of pulses of the demand, other parameters being free.
+
+    `score` (row,) is s~; `columns` (parameter, row) Z; `inverse` (parameter, parameter) N^-1; `information` (lag,) of
+    A and `cover` (row,) of D; `demand` (row,) [m/s²] the positive part of what drives the car.
+    """
+
+    data: DriveData
+    score: FloatArray
+    columns: FloatArray
+    inverse: FloatArray
+    information: FloatArray
+    cover: FloatArray
+    demand: FloatArray
+
+    @classmethod
+    def of(cls, h: Hypothesis, residual: FloatArray) -> _PulseLikelihood:
+        """The likelihood around a hypothesis, whose response without gear shifts leaves `residual`."""
+        data = h.data
+        names = [n for n in h.free if n not in ("shift_depth", "shift_duration")]
+        derivatives = jacobian(h, names)
+        precision, pull = prior_terms(h, names)
+        normal, gradient = information_of_coefficients(data, h.covariance, derivatives, residual)
+        inverse = np.asarray(np.linalg.inv(normal + np.diag(precision + 1e-12)), np.float64)
+        *columns, score = demand_score(h, h.covariance, np.array([*derivatives, residual]), dead_time=False)
+        columns = np.array(columns)
+        score -= (inverse @ (gradient + pull)) @ columns
+        lags = round(WARM_S / data.dt)
+        late = data.time - coordinate_from_start(h, "dead_time")
+        demand = h["K_L"] * np.interp(late, data.time, np.maximum(h.command(), 0.0))
+        information = demand_information(h, h.covariance, lags, dead_time=False)
+        return cls(data, score, columns, inverse, information, frame_cover(h), demand)
+
+    def upshifts(self, level: float, hysteresis: float) -> FloatArray:
+        data = self.data
+        return upshift_times(data.time, data.smooth_speed, data.starts, level, hysteresis)
+
+    def pulses(self, times: FloatArray, duration: float) -> _Pulses:
+        """Of upshifts at `times` (upshift,) [s]; the plant's interruption begins a step of its grid later."""
+        first, values = _pulses(self.data.time, self.data.starts, self.demand, times + self._delay, duration)
+        return _Pulses(first, values)
+
+    @property
+    def _delay(self) -> float:
+        dt = self.data.dt
+        return dt / (int(dt / GRID_S) + 1)
+
+    def size(self, pulses: _Pulses) -> _Size:
+        across = _dots(self.columns, pulses.first, pulses.values)
+        taken = self.inverse @ across
+        return _Size(_energy(pulses.first, pulses.values, self.information, self.cover) - float(across @ taken), taken)
+
+    def gain(self, score: FloatArray, pulses: _Pulses) -> float:
+        """-score' p [nats per depth]."""
+        return -float(_dots(score[None], pulses.first, pulses.values)[0])
+
+    def take_out(self, score: FloatArray, pulses: _Pulses, size: _Size, depth: float) -> None:
+        """`score` beside pulses of that depth (negative: without them), in place."""
+        _take_out_all(score, self.information, self.cover, pulses.first, pulses.values, -depth)
+        score -= depth * (size.others @ self.columns)
+
+
+def _pursued(
+    likelihood: _PulseLikelihood, levels: FloatArray, pulses: list[_Pulses], sizes: list[_Size]
+) -> tuple[FloatArray, float]:
+    """Levels chosen one by one, each at its best depth, and what they gain less `SHIFT_NATS` each."""
+    score = likelihood.score.copy()
+    own = np.array([s.own for s in sizes])
+    free = own > 0.5  # less than half a nat at full depth: nothing to be seen
+    chosen: list[float] = []
+    total = 0.0
+    while len(chosen) < _MOST_LEVELS and free.any():
+        slope = np.array([likelihood.gain(score, p) if f else 0.0 for p, f in zip(pulses, free, strict=True)])
+        depth = np.clip(slope / np.maximum(own, 1e-9), 0.0, 1.0)
+        gains = np.where(free, depth * (slope - 0.5 * depth * own), 0.0)
+        k = int(gains.argmax())
+        if gains[k] <= SHIFT_NATS:
+            break
+        total += float(gains[k]) - SHIFT_NATS
+        chosen.append(float(levels[k]))
+        likelihood.take_out(score, pulses[k], sizes[k], float(depth[k]))
+        free &= _apart(levels, levels[k : k + 1])
+    return np.array(sorted(chosen)), total
+
+
+def _ascended(
+    likelihood: _PulseLikelihood, start: FloatArray, hysteresis: float, depth: float, duration: float
+) -> tuple[FloatArray, float, float]:
+    """Levels, hysteresis [m/s] and common depth at a maximum, coordinate by coordinate."""
+    coarse = np.round(_levels(likelihood.data), 2)
+    levels = [float(g) for g in start]
+    best = _Set(likelihood, levels, hysteresis, duration)
+    depth = best.best_depth() if best.levels else depth
+    for _ in range(_PASSES):
+        before = best.nats(depth)
+        for g in list(best.levels):
+            near = np.round(g + np.arange(-_NEAR_MPS, _NEAR_MPS + 1e-9, _FINE_MPS), 2)
+            best.replace(g, np.append(near[near > LOWEST_MPS], g), depth)
+        while len(best.levels) < _MOST_LEVELS and best.replace(None, coarse, depth):
+            pass
+        for other in _hystereses(likelihood.data, best.levels, best.hysteresis):
+            new = _Set(likelihood, best.levels, other, duration)
+            if new.nats(depth) > best.nats(depth) + 0.5:
+                best = new
+        if not best.levels:
+            break
+        depth = best.best_depth()
+        if best.nats(depth) < before + 0.5:
+            break
+    return np.array(sorted(best.levels)), best.hysteresis, depth
+
+
+class _Set:
+    """A set of levels with one hysteresis [m/s] and one duration [s] of interruptions."""
+
+    def __init__(self, likelihood: _PulseLikelihood, levels: list[float], hysteresis: float, duration: float) -> None:
+        self.likelihood, self.hysteresis, self.duration = likelihood, hysteresis, duration
+        self.levels = list(levels)
+        self._known: dict[float, tuple[_Pulses, _Size]] = {}
+
+    def _pulses(self, level: float) -> tuple[_Pulses, _Size]:
+        if level not in self._known:
+            pulses = self.likelihood.pulses(self.likelihood.upshifts(level, self.hysteresis), self.duration)
+            self._known[level] = pulses, self.likelihood.size(pulses)
+        return self._known[level]
+
+    def _slope_and_size(self) -> tuple[float, float]:
+        """-s~' p and p' A~ p of all pulses together."""
+        each = [self._pulses(g)[0] for g in self.levels]
+        if not each:
+            return 0.0, 0.0
+        first = np.concatenate([p.first for p in each])
+        values = np.zeros((len(first), max(p.values.shape[1] for p in each)))
+        done = 0
+        for p in each:
+            values[done : done + len(p.first), : p.values.shape[1]] = p.values
+            done += len(p.first)
+        order = np.argsort(first, kind="stable")
+        together = _Pulses(first[order], values[order])
+        return self.likelihood.gain(self.likelihood.score, together), self.likelihood.size(together).own
+
+    def best_depth(self) -> float:
+        slope, size = self._slope_and_size()
+        return min(max(slope / max(size, 1e-9), 0.05), 1.0)
+
+    def nats(self, depth: float) -> float:
+        """Gain of the set less `SHIFT_NATS` a level."""
+        slope, size = self._slope_and_size()
+        return depth * (slope - 0.5 * depth * size) - SHIFT_NATS * len(self.levels)
+
+    def replace(self, level: float | None, by: FloatArray, depth: float) -> bool:
+        """Put the best of the levels `by` in place of `level` (None: beside all), or leave it out where none gains more
+        than `SHIFT_NATS`; whether there is one."""
+        if level is not None:
+            self.levels.remove(level)
+        by = by[_apart(by, np.array(self.levels))] if self.levels else by
+        score = self.likelihood.score.copy()
+        for g in self.levels:
+            self.likelihood.take_out(score, *self._pulses(g), depth)
+        gains = np.zeros(len(by))
+        for k, g in enumerate(by):
+            pulses, size = self._pulses(float(g))
+            gains[k] = depth * (self.likelihood.gain(score, pulses) - 0.5 * depth * size.own)
+        if not len(by) or gains.max() <= SHIFT_NATS:
+            return False
+        self.levels.append(float(by[int(gains.argmax())]))
+        return True
+
+
+def _hystereses(data: DriveData, levels: list[float], now: float) -> list[float]:
+    """One hysteresis [m/s] between each two dips of the speed below a level and back, the only values that differ."""
+    dips = [dips_below(data.smooth_speed, data.starts, g) for g in levels]
+    each = np.unique(np.concatenate([np.zeros(0), *dips]))
+    each = each[(each > _DISTINCT_MPS) & (each < 4.0)]
+    edges = np.concatenate([[_DISTINCT_MPS], each, [4.0]])
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    return middle[np.abs(middle - now) > 1e-9].tolist()
+
+
+@njit(cache=True)
+def upshift_times(  # pragma: no cover - compiled
+    time: FloatArray, speed: FloatArray, starts: BoolArray, level: float, hysteresis: float
+) -> FloatArray:
+    """Times (upshift,) [s], between rows, at which the `speed` (row,) [m/s] rises through a `level`, having been
+    `hysteresis` below it since the last one. A stretch that begins above it has that gear already."""
+    out = np.empty(len(time))
+    count = 0
+    above = False
+    for k in range(len(time)):
+        v = max(speed[k], 0.0)
+        if starts[k]:
+            above = v > level
+        elif not above and v > level:
+            before = speed[k - 1]
+            share = min(max((v - level) / (v - before), 0.0), 1.0) if v > before else 0.0
+            out[count] = time[k] - share * (time[k] - time[k - 1])
+            count += 1
+            above = True
+        above = above and v > level - hysteresis
+    return out[:count].copy()
+
+
+@njit(cache=True)
+def dips_below(  # pragma: no cover - compiled
+    speed: FloatArray, starts: BoolArray, level: float
+) -> FloatArray:
+    """How far (dip,) [m/s] the `speed` (row,) fell below a `level` each time before it rose above it again."""
+    out = np.empty(len(speed))
+    count = 0
+    deepest = -1.0  # negative: above the level, or never above it in this stretch
+    seen = False
+    for k in range(len(speed)):
+        if starts[k]:
+            seen, deepest = speed[k] > level, -1.0
+        elif speed[k] > level:
+            if seen and deepest > 0.0:
+                out[count] = deepest
+                count += 1
+            seen, deepest = True, -1.0
+        else:
+            deepest = max(deepest, level - speed[k])
+    return out[:count].copy()
+
+
+@njit(cache=True)
+def _pulses(  # pragma: no cover - compiled
+    time: FloatArray, starts: BoolArray, demand: FloatArray, begins: FloatArray, duration: float
+) -> tuple[IntArray, FloatArray]:
+    """First rows (upshift,) and the lost demand (upshift, row): `demand` times the share of each step that lies within
+    `duration` of `begins`. None reaches into another stretch."""
+    n = len(time)
+    first = np.searchsorted(time, begins, side="right") - 1
+    most = 1
+    for e in range(len(begins)):
+        k = first[e]
+        while k < n - 1 and time[k] < begins[e] + duration:
+            k += 1
+        most = max(most, k - first[e])
+    values = np.zeros((len(begins), most))
+    for e in range(len(begins)):
+        for j in range(most):
+            k = first[e] + j
+            if k >= n - 1 or starts[k + 1]:
+                break
+            h = time[k + 1] - time[k]
+            share = (min(time[k + 1], begins[e] + duration) - max(time[k], begins[e])) / h
+            if share <= 0.0:
+                break
+            values[e, j] = demand[k] * share
+    return first, values
+
+
+@njit(cache=True, fastmath=True)
+def _dots(rows: FloatArray, first: IntArray, values: FloatArray) -> FloatArray:  # pragma: no cover - compiled
+    """Inner products (signal,) of signals `rows` (signal, row) with all pulses."""
+    out = np.zeros(len(rows))
+    n = rows.shape[1]
+    for e in range(len(first)):
+        for j in range(min(values.shape[1], n - first[e])):
+            if values[e, j] != 0.0:
+                for s in range(len(rows)):
+                    out[s] += rows[s, first[e] + j] * values[e, j]
+    return out
+
+
+@njit(cache=True, fastmath=True)
+def _energy(
+    first: IntArray, values: FloatArray, information: FloatArray, cover: FloatArray
+) -> float:  # pragma: no cover - compiled
+    """p' A p of all pulses together."""
+    total = 0.0
+    reach, rows = len(information), values.shape[1]
+    for e in range(len(first)):
+        for f in range(e, len(first)):
+            apart = first[f] - first[e]
+            if apart - rows >= reach:
+                break
+            both = 0.0
+            for i in range(rows):
+                if values[e, i] == 0.0:
+                    continue
+                for j in range(rows):
+                    lag = abs(apart + j - i)
+                    if lag < reach:
+                        both += values[e, i] * values[f, j] * information[lag]
+            both *= cover[first[e]] * cover[first[f]]
+            total += both if e == f else 2.0 * both
+    return float(total)
+
+
+@njit(cache=True)
+def _take_out_all(  # pragma: no cover - compiled
+    score: FloatArray, information: FloatArray, cover: FloatArray, first: IntArray, values: FloatArray, sign: float
+) -> None:
+    """`take_out` of all pulses."""
+    for e in range(len(first)):
+        take_out(score, information, cover, values[e], first[e], sign)

@@ -1,0 +1,228 @@
+"""A hypothesis: a set of effects with values of their parameters, and what it predicts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+
+from avtorch.arrays import FloatArray
+from avtorch.gap.engine.car import simulator_signals
+from avtorch.gap.engine.compiled_plant import read_late, simulate
+from avtorch.gap.engine.coordinates import COORDINATES, EFFECTS, FROM_THE_START, INDEX, base_name, neutral_values
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.likelihood import log_likelihood
+from avtorch.gap.engine.shape_error import ShapeLikelihood
+from avtorch.gap.simulator.plant import GapPlant
+
+_LIMITS: Mapping[str, tuple[float, float]] = {
+    "T_L": (0.02, 4.0),
+    "K_L": (0.1, 4.0),
+    "accel_delay": (-0.025, 0.2),
+    "speed_delay": (-0.01, 0.25),
+    "accel_filter": (0.0, 0.15),
+    "speed_filter": (0.0, 0.15),
+}
+_ALONE_S = -0.15  # least delay where one channel, or the band below `ONE_CHANNEL_HZ`, cannot tell it from the car's
+
+
+@dataclass(eq=False)
+class Hypothesis:
+    """`effects` (keys of `coordinates.EFFECTS`) at `values` (parameter,); those in `onsets` act from that time [s] on.
+
+    `neutral` (parameter,): the user's baseline, GLVD where it has no effects. `shift_speeds` (gear,) [m/s], rising.
+    `lost`: stretches of rows (from, to) whose commands did not arrive. `alone`: delays of the recorder may be negative,
+    as nothing tells them from the car's. `base`: the fitted hypothesis without effects that gains count from.
+    `baseline`: the user's plant, where the compiled one does not have all of its effects.
+
+    `evaluate` sets `predicted` and `residual` (channel, frame, bin), `log_likelihood` [nats] with the noise integrated
+    out, and the noise's `covariance` (band, channel, channel) at its maximum. `evidence.evaluate_evidence` sets the
+    rest.
+    """
+
+    data: DriveData
+    values: FloatArray = field(default_factory=neutral_values)
+    effects: list[str] = field(default_factory=list)
+    onsets: dict[str, float] = field(default_factory=dict)
+    shift_speeds: FloatArray = field(default_factory=lambda: np.zeros(0))
+    lost: tuple[tuple[int, int], ...] = ()
+    neutral: FloatArray = field(default_factory=neutral_values)
+    alone: bool = False
+    base: Hypothesis | None = None
+    baseline: GapPlant | None = None
+
+    predicted: FloatArray = field(init=False, repr=False)
+    residual: FloatArray = field(init=False, repr=False)
+    covariance: FloatArray = field(init=False, repr=False)
+    log_likelihood: float = field(init=False, default=-np.inf)
+
+    claimed: float = field(init=False, default=-np.inf)
+    jacobian: FloatArray = field(init=False, repr=False)
+    information: FloatArray = field(init=False, repr=False)
+    effect_energy: FloatArray | None = field(init=False, default=None, repr=False)
+    shape: ShapeLikelihood | None = field(init=False, default=None, repr=False)
+    shape_log: FloatArray = field(init=False, repr=False)
+    evidence: float = field(init=False, default=-np.inf)
+    score: float = field(init=False, default=-np.inf)
+
+    # parameters ------------------------------------------------------------------------------------------------------
+    @property
+    def free(self) -> list[str]:
+        """Names of the coordinates that a fit moves: lag and gain, the recorder's, those of the effects."""
+        names = ["T_L", "K_L"]
+        for channel in self.data.channels:
+            names += [f"{channel}_delay", f"{channel}_filter"]
+        return names + [c.name for e in self.effects for c in EFFECTS[e].coordinates]
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Least and greatest value of a coordinate in a fit."""
+        if name in COORDINATES:
+            return COORDINATES[name].low, COORDINATES[name].high
+        low, high = _LIMITS[name]
+        return (_ALONE_S if self.alone and name.endswith("_delay") else low), high
+
+    def __getitem__(self, name: str) -> float:
+        return float(self.values[INDEX[name]])
+
+    def __setitem__(self, name: str, value: float) -> None:
+        self.values[INDEX[name]] = value
+
+    def onset_vector(self) -> FloatArray:
+        """Times (parameter,) [s] from which the parameters act."""
+        acts = np.full(len(self.values), FROM_THE_START)
+        for effect, onset in self.onsets.items():
+            for c in EFFECTS[effect].coordinates:
+                acts[INDEX[c.name]] = onset
+        return acts
+
+    # other hypotheses ------------------------------------------------------------------------------------------------
+    def copy(self) -> Self:
+        """A copy with the same prediction, if there is one; what evidence has set is left out."""
+        other = type(self)(
+            data=self.data,
+            values=self.values.copy(),
+            effects=list(self.effects),
+            onsets=dict(self.onsets),
+            shift_speeds=self.shift_speeds,
+            lost=self.lost,
+            neutral=self.neutral,
+            alone=self.alone,
+            base=self.base,
+            baseline=self.baseline,
+        )
+        for name in ("predicted", "residual", "covariance", "log_likelihood"):
+            if hasattr(self, name):
+                setattr(other, name, getattr(self, name))
+        return other
+
+    def on(self, data: DriveData) -> Self:
+        """The same hypothesis about other data of the same rows."""
+        other = self.copy()
+        other.data = data
+        return other.evaluate()
+
+    def with_effect(self, effect: str, start: Sequence[float], onset: float | None = None) -> Self:
+        """The hypothesis with one more effect, its coordinates at `start`, within their limits."""
+        other = self.copy()
+        other.effects.append(effect)
+        if onset is not None:
+            other.onsets[effect] = onset
+        for c, x in zip(EFFECTS[effect].coordinates, start, strict=True):
+            other[c.name] = min(max(x, c.low), c.high)
+        return other
+
+    def without(self, effect: str) -> Self:
+        """The hypothesis without an effect, whose coordinates go back to the baseline's."""
+        other = self.copy()
+        other.effects.remove(effect)
+        other.onsets.pop(effect, None)
+        for c in EFFECTS[effect].coordinates:
+            other[c.name] = self.neutral[INDEX[c.name]]
+        if effect == "command_hold":
+            other.lost = ()
+        return other
+
+    @property
+    def reference_speed(self) -> float:
+        """At which slopes with speed are neutral [m/s]."""
+        return self.data.reference_speed
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Its effects by the table's names."""
+        return tuple(dict.fromkeys(base_name(e) for e in self.effects))
+
+    # prediction -------------------------------------------------------------------------------------------------------
+    def command(self) -> FloatArray:
+        """Commands (row,) [m/s²] as they arrived: lost ones are replaced by the last one before."""
+        if not self.lost:
+            return self.data.command
+        out = self.data.command.copy()
+        for i, j in self.lost:
+            out[i:j] = self.data.command[max(i - 1, 0)]
+        return out
+
+    def on_grid(
+        self, values: FloatArray | None = None, onsets: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """The accelerometer's reading [m/s²] and the speed gained in its stretch [m/s] on the grid, (grid,) each."""
+        p = self.values if values is None else values
+        data, grid = self.data, self.data.grid
+        if self.baseline is not None or any(EFFECTS[e].kind is not None for e in self.effects):
+            return simulator_signals(self, p, onsets)
+        accel, gained = np.empty(len(grid.time)), np.empty(len(grid.time))
+        simulate(
+            p,
+            self.onset_vector() if onsets is None else onsets,
+            grid.time,
+            self.command()[grid.row],
+            grid.speed,
+            grid.starts,
+            grid.accel0,
+            self.shift_speeds,
+            self.reference_speed,
+            float(data.time[0]),
+            max(float(data.time[-1] - data.time[0]), 1.0),
+            accel,
+            gained,
+        )
+        return accel, gained
+
+    def recorder_rows(
+        self, accel: FloatArray, gained: FloatArray, values: FloatArray | None = None
+    ) -> tuple[FloatArray | None, FloatArray | None]:
+        """Acceleration and gained speed (grid,) as the recorder shows them: (row,), delayed, filtered, held; None where
+        a channel was not recorded."""
+        p = self.values if values is None else values
+        data, grid = self.data, self.data.grid
+        a = v = None
+        if data.accel is not None:
+            a = np.empty(len(data.time))
+            read_late(data.time, grid.time, accel, p[INDEX["accel_delay"]], a)
+            a = data.low_pass(a, p[INDEX["accel_filter"]])
+        if data.speed is not None:
+            v = np.empty(len(data.time))
+            read_late(data.time, grid.time, gained, p[INDEX["speed_delay"]], v)
+            v = data.held(data.low_pass(v, p[INDEX["speed_filter"]]))
+        return a, v
+
+    def recorded(self, accel: FloatArray, gained: FloatArray, values: FloatArray | None = None) -> list[FloatArray]:
+        """The same as the channels that are compared, (row,) each."""
+        return self.data.channel_rows(*self.recorder_rows(accel, gained, values))
+
+    def rows(self, values: FloatArray | None = None, onsets: FloatArray | None = None) -> list[FloatArray]:
+        """The response (row,) [m/s²] of each channel, at other `values` or `onsets` (parameter,) where given."""
+        return self.recorded(*self.on_grid(values, onsets), values)
+
+    def response(self, values: FloatArray | None = None, onsets: FloatArray | None = None) -> FloatArray:
+        """The response in coefficients (channel, frame, bin)."""
+        return self.data.transform(self.rows(values, onsets))
+
+    def evaluate(self) -> Self:
+        """Predict and compare."""
+        self.predicted = self.response()
+        self.residual = self.data.measured - self.predicted
+        self.log_likelihood, self.covariance = log_likelihood(self.data, self.residual)
+        return self

@@ -1,0 +1,253 @@
+"""Posterior draws of a hypothesis's coordinates: by SGLD, by importance where SGLD fails, or Laplace's.
+
+The sampler is the project's own (`avtorch.inference`), with parallel chains, whitened at the mode of a `Surrogate`.
+Most of its gradients are the surrogate's, corrected at random steps; how often follows from the surrogate's error. Chains
+must agree (nested R-hat), and draws satisfy Stein's identity of the exact density. All draws are of the tempered
+density; then they are stretched to cover what parts of the drive disagree on (`laplace`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avtorch.arrays import FloatArray
+from avtorch.errors import InputError
+from avtorch.gap.engine.coordinates import COORDINATES, EFFECTS, base_name
+from avtorch.gap.engine.density import HypothesisDensity
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.laplace import Laplace
+from avtorch.gap.engine.priors import TEMPER
+from avtorch.gap.engine.surrogate import Corrected, Surrogate, terms_of, trusted_square
+from avtorch.gap.engine.torch_plant import not_in_torch, own_value
+from avtorch.inference.coordinates import Coordinates, stiffness
+from avtorch.inference.importance import ImportanceSettings, weighted_draws
+from avtorch.inference.map import Mode, find_mode
+from avtorch.inference.pareto import reliable
+from avtorch.inference.posterior import effective_sample_size
+from avtorch.inference.sampler import sample as walk
+from avtorch.inference.sampler_settings import SamplerSettings
+
+STEP = 2.0
+"""SGLD's step in whitened coordinates; see `SamplerSettings`."""
+
+_INFLATED = 0.02  # relative increase of a variance by gradient noise
+_THROWN = 3.0  # [posterior standard deviations] largest displacement by one correction
+_RAREST = 16.0  # steps between corrections
+_CLIFF = 9.0  # mean square error of the surrogate's whitened gradient above which no step suits the density
+_STEPS = 500.0  # of SGLD, most
+_GRADIENT_STEPS = 1.6e7  # of the grid in exact gradients, most: ten seconds on one core
+_LONGEST = 1_000_000  # steps of a grid whose responses fit in memory
+_CHECKED = 96  # draws that Stein's identity is checked at
+_LET_PASS = 0.15  # relative error of a variance
+_FEWEST = 30.0  # effective draws by importance
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Draws `x` (chain, draw, coordinate) of the coordinates `names`; one that stands at a limit out of reach is constant.
+
+    `method`: "sgld"; "importance" where the density is too steep in places for Langevin steps; "laplace" where both fail
+    or there is no gradient; `why` says so. `effective`: effective number of draws of the slowest coordinate.
+    `exact_share`: share of exact gradients. `widened`: largest factor on a standard deviation for what parts of the
+    drive disagree on.
+    """
+
+    names: tuple[str, ...]
+    x: FloatArray = field(repr=False)
+    method: Literal["sgld", "importance", "laplace"]
+    effective: float
+    exact_share: float = 1.0
+    widened: float = 1.0
+    why: str = ""
+
+    def __getitem__(self, name: str) -> FloatArray:
+        """Draws (chain, draw) of a coordinate."""
+        return self.x[..., self.names.index(name)]
+
+    def of_plant(self, h: Hypothesis) -> dict[str, FloatArray]:
+        """Draws (chain, draw) under the names of a plant's parameters, in their own units (`GapPlant.with_values`)."""
+        out = {name: self[name] for name in ("T_L", "K_L")}
+        for effect in h.effects:
+            for c in EFFECTS[effect].coordinates:
+                if c.parameter:
+                    own = own_value(COORDINATES[c.name], torch.as_tensor(self[c.name])).numpy()
+                    out[f"{base_name(effect)}.{c.parameter}"] = own
+        return out
+
+
+def sample(
+    h: Hypothesis,
+    *,
+    chains: int = 16,
+    draws: int = 50,
+    seed: int = 0,
+    temper: float = TEMPER,
+    method: Literal["sgld", "laplace"] = "sgld",
+    widen: bool = True,
+) -> Draws:
+    """Draws of the free coordinates of a fitted, evaluated hypothesis; its onsets and shift speeds are held.
+
+    `method` "laplace" asks for normal draws alone. `widen` False: draws of the density itself. Raises `InputError` for
+    fewer than 1 chain or 4 draws.
+    """
+    if chains < 1 or draws < 4:
+        raise InputError(f"draws: found {chains} chains of {draws}, needs 1 or more of 4 or more")
+    rng = np.random.default_rng(seed)
+    normal = Laplace.of(h, temper=temper)
+    why = "" if method == "sgld" else "not asked for"
+    why = why or not_in_torch(h)
+    if not why and len(h.data.grid.time) > _LONGEST:
+        why = "the drive is too long for gradients"
+    found = None
+    if not why:
+        density = HypothesisDensity(h, temper, normal.names, np.sqrt(np.diag(normal.covariance)))
+        generator = torch.Generator().manual_seed(seed)
+        found, why = _sampled(density, normal, chains, draws, generator, rng)
+    if found is None:
+        x = normal.draws(chains * draws, rng, widen=widen).reshape(chains, draws, -1)
+        found = Draws(normal.names, x, "laplace", float(chains * draws), 0.0, why=why)
+    elif widen:
+        found = Draws(**{**vars(found), "x": normal.stretched(found.x)})
+    return _complete(found, h, normal.widest if widen else 1.0)
+
+
+def _complete(found: Draws, h: Hypothesis, widened: float) -> Draws:
+    """The draws with the coordinates that were held."""
+    x = np.empty((*found.x.shape[:-1], len(h.free)))
+    for k, name in enumerate(h.free):
+        x[..., k] = found[name] if name in found.names else h[name]
+    return Draws(**{**vars(found), "names": tuple(h.free), "x": x, "widened": widened})
+
+
+def _sampled(
+    density: HypothesisDensity,
+    normal: Laplace,
+    chains: int,
+    draws: int,
+    generator: torch.Generator,
+    rng: np.random.Generator,
+) -> tuple[Draws | None, str]:
+    """Draws of the density by SGLD or importance; None where neither can be had; and why not by SGLD."""
+    surrogate, mode = fitted(density, normal, rng)
+    points = exact_one_in(density, surrogate, mode, generator)
+    target = Corrected(density, surrogate, mode, max(points, 1))
+    z, why = None, "gradients jump within a posterior standard deviation"
+    if points:
+        z, why = _walked(target, chains, draws, generator)
+    if z is not None:
+        x, worth = density.constrain(z), float(effective_sample_size(z).min())
+        return Draws(density.names, x.numpy(), "sgld", worth, 1 / points), ""
+    settings = ImportanceSettings(draws=200, rounds=4, enough=200.0)
+    weighted = weighted_draws(target, settings, generator=generator, mode=mode)
+    worth = float(weighted.effective[0])
+    if worth < _FEWEST or not float(weighted.pareto_k[0]) < reliable(len(weighted.z)):
+        return None, f"{why}; importance weights are not reliable either"
+    z = weighted.equal(chains * draws, generator)[:, 0].reshape(chains, draws, -1)
+    return Draws(density.names, density.constrain(z).numpy(), "importance", worth, why=why), why
+
+
+def fitted(density: HypothesisDensity, normal: Laplace, rng: np.random.Generator) -> tuple[Surrogate, Mode]:
+    """A surrogate around the density's mode, and that mode."""
+    count = 2 * terms_of(len(normal.mean)) + 8
+    x = normal.draws(count, rng, widen=False, times=1.2)
+    for turn in range(3):
+        surrogate = Surrogate.of(density, x)
+        mode = find_mode(surrogate)
+        if turn == 2 or not bool(mode.converged[0]):
+            break
+        slope = torch.autograd.functional.jacobian(density.constrain, mode.z[0])
+        away = torch.linalg.solve(surrogate.scale, density.constrain(mode.z[0]) - surrogate.centre)
+        spread = 1.2 * torch.linalg.svdvals(torch.linalg.solve(surrogate.scale, slope @ mode.scale[0]))
+        if float(away.abs().max()) < 0.5 and float(spread.max()) < 1.6 and float(spread.min()) > 0.6:
+            break
+        z = mode.z[0] + 1.2 * torch.as_tensor(rng.standard_normal((count, len(slope)))) @ mode.scale[0].mT
+        x = density.constrain(z).numpy()
+    if not bool(mode.converged[0]):  # far from any quadratic: Laplace's
+        mode = _normal_mode(density, normal)
+    return surrogate, Mode(mode.z, mode.scale, density.value(mode.z), mode.converged)
+
+
+def _normal_mode(density: HypothesisDensity, normal: Laplace) -> Mode:
+    z = density.unconstrain(torch.as_tensor(np.clip(normal.mean, *normal.limits.T)))
+    root = torch.linalg.cholesky(torch.as_tensor(normal.covariance))
+    back = torch.linalg.solve(torch.autograd.functional.jacobian(density.constrain, z), root)
+    scale = torch.linalg.cholesky(back @ back.mT)
+    return Mode(z[None], scale[None], torch.zeros(1, dtype=z.dtype), torch.tensor([True]))
+
+
+def exact_one_in(density: HypothesisDensity, surrogate: Surrogate, mode: Mode, generator: torch.Generator) -> int:
+    """The interval n at which gradients must be exact, so that their noise widens the posterior within tolerance.
+
+    Noise of variance s² in whitened gradients widens a variance by `step s² / 4`. Correcting one gradient in n leaves
+    `(n - 1)` times the squared error of the surrogate, measured at slightly widened draws from Laplace's approximation.
+    0 where that error is so large that the density is too steep for SGLD. At the limit of the surrogate's range, a
+    single correction must not displace a chain far either.
+    """
+    size, count = mode.z.shape[-1], 16
+    w = torch.randn(count + size, 1, size, dtype=mode.z.dtype, generator=generator)
+    edge, length = trusted_square(size) ** 0.5, w.norm(dim=-1, keepdim=True)
+    w = torch.cat([1.2 * w[:count] * (edge / (1.2 * length[:count])).clamp_max(1.0), w[count:] * edge / length[count:]])
+    z = mode.z + w @ mode.scale[0].mT
+    lacking = (density.score(z) - surrogate.score(z)) @ mode.scale[0]
+    if not bool(lacking.isfinite().all()):
+        return 0
+    typical = float(lacking[:count].square().mean(0).max().clamp_min(1e-12))
+    if typical > _CLIFF:
+        return 0
+    farthest = float(lacking[count:].abs().max().clamp_min(1e-12))
+    return int(min(_RAREST, 1 + 4 * _INFLATED / (STEP * typical), 1 + _THROWN / farthest))
+
+
+def _walked(
+    target: Corrected, chains: int, draws: int, generator: torch.Generator
+) -> tuple[Tensor | None, str]:
+    """SGLD draws of `z` (chain, draw, coordinate), or None and the reason; the number of gradients is bounded."""
+    density, mode = target.exact, target.mode
+    steepness = float(stiffness(density, Coordinates.of(mode)))
+    steps = min(_STEPS, _GRADIENT_STEPS / len(density.hypothesis.data.grid.time) * target.points / chains)
+    thinning = 2 if draws * 2 + 4 <= steps else 1
+    longest = max([1.0, *(t for t in (1.5, 2.0, 3.0, 4.0) if (4 * t + thinning * draws) * t <= steps)])
+    if steepness > 2 * longest or thinning * draws + 4 > 2 * steps:
+        return None, f"its shape is far from normal (in places {steepness:.0f} times as steep), SGLD would take too long"
+    settings = SamplerSettings(
+        chains=chains,
+        draws=draws,
+        burn_in=4,
+        thinning=thinning,
+        step=STEP,
+        spread=1.0,
+        longest=longest,
+        attempts=1,
+        batch=1 if target.points > 1 else None,
+        compare=False,  # too expensive at hundreds of points; Stein's identity below replaces it
+    )
+    walked = walk(target, settings, generator=generator, mode=mode)
+    if not bool(walked.converged[0]):
+        return None, walked.why[0]
+    z = density.unconstrain(walked.draws[:, :, 0])
+    off = stein_discrepancy(density, mode, z, generator)
+    if off > 0:
+        return None, f"by Stein's identity a variance of its draws is off by {off:.2g}"
+    return z, ""
+
+
+def stein_discrepancy(density: HypothesisDensity, mode: Mode, z: Tensor, generator: torch.Generator) -> float:
+    """Largest violation of Stein's identity by draws `z` (chain, draw, coordinate); 0 where it is not significant.
+
+    Under the density the mean of `(w - mean) dU/dw` is 1 for each coordinate. A share of the variance and three standard
+    errors are tolerated.
+    """
+    flat = z.flatten(0, 1)
+    some = flat[torch.randperm(len(flat), generator=generator)[:_CHECKED]][:, None]
+    slope = -(density.score(some) @ mode.scale[0])[:, 0]
+    away = torch.linalg.solve_triangular(mode.scale[0], (some[:, 0] - flat.mean(0)).mT, upper=False).mT
+    products = away * slope
+    off = (products.mean(0) - 1).abs()
+    excess = off - _LET_PASS - 3 * products.std(0) / len(products) ** 0.5
+    return float(off.max()) if bool((excess > 0).any()) else 0.0

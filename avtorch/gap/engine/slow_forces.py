@@ -1,0 +1,411 @@
+r"""Slow random forces: process noise, gusts and roads, told apart by the spectrum that both channels share.
+
+Below `SLOW_HZ` a force on the body shows in the acceleration and in the differenced speed alike, sensors' noise does
+not. In band b of the lapped transform the residuals of the two channels are Gaussian with the covariance
+
+    V_b = P_b 1 1' + diag(a_b, c_b),        P_b = int G_b(f) S(f) df,
+
+where S is the one-sided spectrum of the common force, G_b what the transform makes of a tone, and the variances a_b,
+c_b of the sensors are free. Three spectra compete:
+
+    process noise    2 q^2 |H(f)|^2,  H = (x j w + T) / (1 - x w^2 + T j w)    white jerk, pulled back by the actuator
+    gust             4 s^2 tau / (1 + (w tau)^2)                               Ornstein-Uhlenbeck (Dryden, MIL-F-8785C)
+    road             flat below v / L, then nothing                            a grade of a longest wavelength L
+
+S_b n_b is Wishart distributed (Anderson 2003, ch. 7). For a given P_b the sensors' variances at the maximum are the
+root of a cubic (`wishart_profile`), so a grid over sizes and times costs a few milliseconds. Process noise is always
+there: a gust or a road counts by what it gains over it.
+
+With one channel nothing is common: what exceeds the noise of a smooth sensor is the force.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from scipy.fft import dct
+
+from avtorch.arrays import FloatArray
+from avtorch.gap.engine.coordinates import INDEX
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.priors import SLOW_HZ
+
+# priors: log-normal, by mean and standard deviation of the logarithm
+PROCESS_NOISE = (0.03, 0.8)
+"""Size q of white jerk [m/s³/√Hz]: 0.1 m/s³ over a row of 0.1 s, and rough roads (SPEC: 0.1, rough 0.3 m/s³)."""
+GUST_SD_MPS2 = (0.2, 0.9)
+"""Size of a gust [m/s²]: a wind that varies by 3 m/s around 20 m/s of airspeed, on a car; lorries feel more."""
+GUST_TIME_S = (2.3, 0.6)
+"""Correlation time of a gust [s]: eddies of 50 m at 20 m/s."""
+ROAD_SD_MPS2 = (0.25, 0.9)
+"""Size of what a grade does [m/s²]: 2.5 % root mean square, as on hilly roads."""
+ROAD_LENGTH_M = (450.0, 0.6)
+"""Shortest wavelength of a grade [m]: vertical curves are built to be seen ahead over (AASHTO sight distances)."""
+
+# grids: wide enough for three standard deviations of the priors, ratios of 1.3 to 1.5
+PROCESS_NOISE_GRID = np.geomspace(0.004, 0.6, 20)
+PROCESS_NOISE_STEPS = (0, 2, 4, 7, 10)
+"""Steps of its grid by which process noise may be smaller beside a gust or a road than alone."""
+SIZE_GRID_MPS2 = np.geomspace(0.02, 0.8, 16)
+GUST_TIME_GRID_S = np.array([0.7, 1.0, 1.5, 2.2, 3.2, 4.7, 7.0])
+ROAD_LENGTH_GRID_M = np.array([180.0, 280.0, 420.0, 650.0, 1000.0])
+PULLING_LAG_RATIOS = 2.0 ** np.arange(6)
+"""Lags over the actuator's own, by which a saturated actuator pulls back what disturbs it [-]."""
+ONSET_SHARES = (0.12, 0.85)
+"""Shares of a drive's frames between which a gust may set in: both parts show what they hold."""
+STRONGER_GRID = np.array([1.0, 1.4, 2.0])
+"""Power of a gust after it has set in, over its mean power in the whole drive [-]: 1 at the start, 2 halfway."""
+
+AT_LIMIT = 0.97
+"""Share of the limit of jerk from which on it is at work [-]: a filter of the recorder rounds its corners."""
+ROAD_STEEPNESS = 8
+"""Order of the end of a road's spectrum [-]: steep, like that of a curve with continuous curvature."""
+SENSOR_ALONE_HZ = 0.5
+"""With one channel, frequency above which the least of its spectrum is the sensor's own noise [Hz]."""
+
+_SENSOR_FLOOR = 1e-4  # least variance of a sensor, relative to the residual's: rounding, no sensor is as good
+_POWER_FLOOR = 1e-12  # (m/s²)²: keeps covariances regular where there is no force
+
+
+class BandResponse(NamedTuple):
+    """What the transform makes of tones: `energy` (band, tone) [Hz] times a one-sided spectrum (tone,) is the mean
+    square of a coefficient in each band below `SLOW_HZ`. `frequency` (tone,) [Hz]; integration is included."""
+
+    frequency: FloatArray
+    energy: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class SlowForces:
+    """Slow forces in a residual, at the maximum over their grids.
+
+    `log_likelihood` [nats] of process noise alone, its prior included, over the lowest `bands` bands; `gust`, `road`
+    [nats]: what either gains over it, the difference of priors included. `process_noise` [m/s³/√Hz]; `gust_sd`,
+    `road_sd` [m/s²]; `gust_time` [s]; `road_length` [m]: the best of each grid.
+
+    `process_power`, `gust_power` (band,) [(m/s²)²] at the best gust; `covariance` (band, channel, channel) and `counts`
+    (band,) are what was explained.
+    """
+
+    log_likelihood: float
+    bands: int
+    process_noise: float
+    gust: float
+    gust_sd: float
+    gust_time: float
+    road: float
+    road_sd: float
+    road_length: float
+    process_power: FloatArray = field(repr=False)
+    gust_power: FloatArray = field(repr=False)
+    covariance: FloatArray = field(repr=False)
+    counts: FloatArray = field(repr=False)
+
+
+# spectra --------------------------------------------------------------------------------------------------------------
+def process_spectrum(frequency: FloatArray, lag: float | FloatArray, square_period: float = 0.0) -> FloatArray:
+    """One-sided spectrum (..., tone) [(m/s²)²/Hz] of unit white jerk behind an actuator of this `lag` [s] (...,) and
+    `square_period` [s²], that of its second pole."""
+    w = 2 * np.pi * frequency
+    T = np.asarray(lag, float)[..., None]
+    H = (1j * w * square_period + T) / (1 - square_period * w * w + 1j * w * T)
+    return 2 * np.abs(H) ** 2
+
+
+def gust_spectrum(frequency: FloatArray, time: float | FloatArray) -> FloatArray:
+    """One-sided spectrum (..., tone) [1/Hz] of an Ornstein-Uhlenbeck process of variance 1 and this correlation time
+    [s] (...,)."""
+    tau = np.asarray(time, float)[..., None]
+    return 4 * tau / (1 + (2 * np.pi * frequency * tau) ** 2)
+
+
+def road_spectrum(frequency: FloatArray, corner: float | FloatArray) -> FloatArray:
+    """One-sided spectrum (..., tone) [1/Hz] of variance 1, flat below `corner` [Hz] (...,)."""
+    end = np.asarray(corner, float)[..., None]
+    width = math.pi / ROAD_STEEPNESS / math.sin(math.pi / ROAD_STEEPNESS)  # over which a flat spectrum has variance 1
+    return 1 / (1 + (frequency / end) ** ROAD_STEEPNESS) / (width * end)
+
+
+def band_response(data: DriveData) -> BandResponse:
+    """The response of bands below `SLOW_HZ` to tones of any phase; kept in `data.cache`.
+
+    A coefficient is sum_n h_n x_n; of a stationary x its mean square is int S(f) |H(f)|² df, H the Fourier transform of
+    its row h of the transform. Its real and imaginary parts are the coefficients of a cosine and a sine.
+    """
+    if "slow_band_response" not in data.cache:
+        edges = data.band_edges
+        bands = min(int(np.searchsorted(data.frequency[edges[:-1]], SLOW_HZ)), data.band_count)
+        M = data.frame_rows
+        h = M // 2
+        tones = _tones(float(data.frequency[1] - data.frequency[0]))
+        phase = 2 * np.pi * tones[:, None] * np.arange(2 * M) * data.dt
+        w = np.concatenate([np.cos(phase), np.sin(phase)]) * data.window
+        folded = np.concatenate([-w[:, M + h - 1 : M - 1 : -1] - w[:, M + h :], w[:, :h] - w[:, M - 1 : h - 1 : -1]], 1)
+        squares = np.asarray(dct(folded, type=4, norm="ortho", axis=1))[:, : edges[bands]] ** 2
+        each = squares[: len(tones)] + squares[len(tones) :]
+        energy = np.add.reduceat(each, edges[:bands], axis=1) / np.diff(edges[: bands + 1])
+        steps = np.diff(tones, prepend=tones[0], append=tones[-1])
+        data.cache["slow_band_response"] = BandResponse(tones, energy.T * 0.5 * (steps[1:] + steps[:-1]))
+    return data.cache["slow_band_response"]
+
+
+def band_covariance(
+    data: DriveData, residual: FloatArray, frames: slice | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Mean products (band, channel, channel) of residuals (channel, frame, bin), and coefficients a channel (band,).
+
+    `frames`: of these frames only.
+    """
+    part = residual if frames is None else residual[:, frames]
+    products = np.einsum("ifk,jfk->ijk", part, part)
+    counts = np.diff(data.band_edges) * float(part.shape[1])
+    return np.moveaxis(np.add.reduceat(products, data.band_edges[:-1], axis=-1) / counts, -1, 0), counts
+
+
+# likelihoods of a common power ----------------------------------------------------------------------------------------
+def wishart_log_likelihood(
+    covariance: FloatArray, counts: FloatArray, power: FloatArray, variances: FloatArray
+) -> FloatArray:
+    """Nats (..., band) of a common `power` (..., band) beside sensors of these `variances` (..., band, 2).
+
+    `covariance` (..., band, 2, 2) is of `counts` (..., band) coefficients; its own entropy and constants are left out.
+    """
+    a, c = variances[..., 0], variances[..., 1]
+    determinant = a * c + power * (a + c)
+    trace = covariance[..., 0, 0] * (c + power) + covariance[..., 1, 1] * (a + power)
+    trace = (trace - 2 * covariance[..., 0, 1] * power) / determinant
+    return -0.5 * counts * (np.log(determinant) + trace)
+
+
+def wishart_profile(covariance: FloatArray, counts: FloatArray, power: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Nats (..., band) of a common `power` (..., band) at the best sensors, and their variances (..., band, 2).
+
+    `covariance` S (band, 2, 2) of `counts` (band,) coefficients. At the maximum V = P 1 1' + diag(a, c) has a zero
+    diagonal of V^-1 (V - S) V^-1, which holds where a + P = k s_00 and c + P = k s_11 with
+
+        s_00 s_11 (k³ - k²) + (2 P s_01 - P²) k - P² = 0.
+
+    Where that needs a negative variance, one sensor is nearly perfect, and the other's variance has a closed form.
+    """
+    flat = np.ascontiguousarray(np.reshape(power, (-1, power.shape[-1])), float)
+    nats, variances = _profile(np.ascontiguousarray(covariance), np.asarray(counts, float), flat)
+    return nats.reshape(power.shape), variances.reshape(*power.shape, 2)
+
+
+@njit(cache=True)
+def _profile(covariance: FloatArray, counts: FloatArray, power: FloatArray) -> tuple[FloatArray, FloatArray]:
+    nats, variances = np.empty(power.shape), np.empty((*power.shape, 2))
+    for b in range(power.shape[1]):
+        s00, s11 = max(covariance[b, 0, 0], _POWER_FLOOR), max(covariance[b, 1, 1], _POWER_FLOOR)
+        s01, mean = covariance[b, 0, 1], math.sqrt(s00 * s11)
+        least0, least1 = _SENSOR_FLOOR * s00, _SENSOR_FLOOR * s11
+        for i in range(power.shape[0]):
+            P = max(power[i, b], _POWER_FLOOR)
+            p, r = P / mean, s01 / mean
+            best, a, c = math.inf, least0, least1
+            # only channels that are nearly one (r > 0.96) have two maxima: the cubic's largest root and its least
+            for start in (1 + max(p - r, 0.0), p):
+                k = _root(p, r, start)
+                if k * s00 - P >= least0 and k * s11 - P >= least1:
+                    cost = _cost(s00, s11, s01, P, k * s00 - P, k * s11 - P)
+                    if cost < best:
+                        best, a, c = cost, k * s00 - P, k * s11 - P
+                if r < 0.96:
+                    break
+            if best == math.inf or r >= 0.96:  # one sensor perfect: regression on it leaves the variance of the other
+                on0, on1 = P / (least0 + P), P / (least1 + P)
+                rest1 = max(s11 - 2 * on0 * s01 + on0 * on0 * s00 - on0 * least0, least1)
+                rest0 = max(s00 - 2 * on1 * s01 + on1 * on1 * s11 - on1 * least1, least0)
+                cost = _cost(s00, s11, s01, P, least0, rest1)
+                if cost < best:
+                    best, a, c = cost, least0, rest1
+                cost = _cost(s00, s11, s01, P, rest0, least1)
+                if cost < best:
+                    best, a, c = cost, rest0, least1
+            nats[i, b] = -0.5 * counts[b] * best
+            variances[i, b, 0], variances[i, b, 1] = a, c
+    return nats, variances
+
+
+@njit(cache=True)
+def _root(p: float, r: float, k: float) -> float:
+    """Root of k³ - k² + (2 p r - p²) k - p² by Newton's method from `k`.
+
+    1 + max(p - r, 0), an upper bound, leads down to the largest root, p up to the least. Where a step fails, bisection.
+    """
+    low, high = 0.0, 1 + max(p - r, 0.0)
+    for _ in range(60):
+        value = ((k - 1) * k + 2 * p * r - p * p) * k - p * p
+        gradient = (3 * k - 2) * k + 2 * p * r - p * p
+        # nats are flat at their maximum, so that half of the digits are enough
+        if abs(value) <= 1e-8 * k * abs(gradient):
+            break
+        if value > 0:
+            high = k
+        else:
+            low = k
+        k = k - value / gradient if gradient != 0 else low
+        if not low < k < high:
+            k = 0.5 * (low + high)
+    return k
+
+
+@njit(cache=True)
+def _cost(s00: float, s11: float, s01: float, P: float, a: float, c: float) -> float:
+    """log det V + tr V^-1 S."""
+    determinant = a * c + P * (a + c)
+    return math.log(determinant) + (s00 * (c + P) + s11 * (a + P) - 2 * s01 * P) / determinant
+
+
+# the forces -----------------------------------------------------------------------------------------------------------
+def pulling_lags(h: Hypothesis) -> FloatArray:
+    """Lags (lag,) [s] by which the actuator of a hypothesis may pull back what disturbs the car.
+
+    Its own; while a limit of jerk is at work it does not answer, and process noise goes on for longer.
+    """
+    lag, inverse_jerk = h["T_L"], h["inverse_jerk"]
+    if inverse_jerk <= 0 or h.data.accel is None:
+        return np.array([lag])
+    values = h.values.copy()
+    values[[INDEX["accel_delay"], INDEX["accel_filter"]]] = 0.0
+    slope = np.abs(np.diff(h.rows(values)[0])) / np.diff(h.data.time)
+    limited = float((slope > AT_LIMIT / inverse_jerk).mean())
+    return np.asarray(lag * (1 + limited * (PULLING_LAG_RATIOS - 1)), float)
+
+
+def slow_forces(
+    data: DriveData,
+    residual: FloatArray,
+    values: FloatArray,
+    given: tuple[FloatArray, FloatArray] | None = None,
+    lags: FloatArray | None = None,
+) -> SlowForces:
+    """Process noise, gust and road in `residual` (channel, frame, bin) of a hypothesis with `values` (parameter,).
+
+    `given`: covariance (band, channel, channel) and counts (band,) in place of the residual's; bands beyond `SLOW_HZ`
+    are ignored. `lags` (lag,) [s], see `pulling_lags`: the likeliest counts; T_L where not given.
+    """
+    frequency, energy = band_response(data)
+    bands = len(energy)
+    covariance, counts = band_covariance(data, residual) if given is None else given
+    covariance, counts = np.ascontiguousarray(covariance[:bands]), np.asarray(counts[:bands], float)
+
+    def nats(power: FloatArray) -> FloatArray:
+        """(...,) of powers (..., band)."""
+        if data.channel_count == 2:
+            return wishart_profile(covariance, counts, power)[0].sum(-1)
+        return _one_channel(data, covariance[:, 0, 0], counts, power).sum(-1)
+
+    lags = np.atleast_1d(values[INDEX["T_L"]] if lags is None else lags)
+    unit = process_spectrum(frequency, lags, values[INDEX["square_period"]]) @ energy.T
+    process = PROCESS_NOISE_GRID[:, None] ** 2 * unit[:, None]  # (lag, size, band)
+    prior = _log_normal(PROCESS_NOISE_GRID, PROCESS_NOISE)
+    alone = nats(process) + prior
+    lag, most = np.unravel_index(np.argmax(alone), alone.shape)
+    base = float(alone[lag, most])
+    smaller = np.unique(np.clip(most - np.array(PROCESS_NOISE_STEPS), 0, None))
+    process, prior = process[lag, smaller], prior[smaller]
+
+    def best(unit: FloatArray, sizes: tuple[float, float], shape_prior: FloatArray) -> tuple[float, tuple[int, ...]]:
+        """Most nats over process noise alone, and where: of process noise, of the size, of the spectrum's shape."""
+        slow = SIZE_GRID_MPS2[:, None, None] ** 2 * unit
+        total = nats(process[:, None, None] + slow) + prior[:, None, None]
+        total += _log_normal(SIZE_GRID_MPS2, sizes)[:, None] + shape_prior
+        at = np.unravel_index(np.argmax(total), total.shape)
+        return float(total[at]) - base, tuple(int(i) for i in at)
+
+    gusts = gust_spectrum(frequency, GUST_TIME_GRID_S) @ energy.T
+    gust, (g0, g1, g2) = best(gusts, GUST_SD_MPS2, _log_normal(GUST_TIME_GRID_S, GUST_TIME_S))
+    speed = max(float(data.smooth_speed.mean()), 2.0)
+    roads = road_spectrum(frequency, speed / ROAD_LENGTH_GRID_M) @ energy.T
+    road, (_, r1, r2) = best(roads, ROAD_SD_MPS2, _log_normal(ROAD_LENGTH_GRID_M, ROAD_LENGTH_M))
+    return SlowForces(
+        log_likelihood=base,
+        bands=bands,
+        process_noise=float(PROCESS_NOISE_GRID[most]),
+        gust=gust,
+        gust_sd=float(SIZE_GRID_MPS2[g1]),
+        gust_time=float(GUST_TIME_GRID_S[g2]),
+        road=road,
+        road_sd=float(SIZE_GRID_MPS2[r1]),
+        road_length=float(ROAD_LENGTH_GRID_M[r2]),
+        process_power=process[g0],
+        gust_power=SIZE_GRID_MPS2[g1] ** 2 * gusts[g2],
+        covariance=covariance,
+        counts=counts,
+    )
+
+
+def gust_onset(data: DriveData, residual: FloatArray, found: SlowForces) -> tuple[float, float | None]:
+    """Nats of the gust `found` in a residual if it sets in during the drive, over one that blows throughout, and when.
+
+    Sensors and process noise are alike before and after. (0, None) where it does not, or drives are short. Time [s].
+    """
+    frames = data.frame_count
+    if frames < 10:
+        return 0.0, None
+    bands, process, gust = found.bands, found.process_power, found.gust_power
+    whole = found.covariance
+    if data.channel_count == 2:
+        variances = wishart_profile(whole, found.counts, process + gust)[1]
+    else:
+        variances = np.maximum(whole[:, 0, 0] - process - gust, _SENSOR_FLOOR * whole[:, 0, 0])
+
+    def nats(covariance: FloatArray, counts: FloatArray, power: FloatArray) -> FloatArray:
+        """(...,) of powers (..., band), the sensors as they are."""
+        if data.channel_count == 2:
+            return wishart_log_likelihood(covariance, counts, power, variances).sum(-1)
+        total = power + variances
+        return (-0.5 * counts * (np.log(total) + covariance[..., 0, 0] / total)).sum(-1)
+
+    edges = data.band_edges[: bands + 1]
+    low = residual[:, :, : edges[-1]]
+    products = np.moveaxis(np.add.reduceat(low[:, None] * low, edges[:-1], axis=-1), 2, 0)  # frame, C, C, band
+    before = np.moveaxis(np.cumsum(products, axis=0), -1, 1) / np.diff(edges)[:, None, None]
+    cuts = np.arange(max(int(ONSET_SHARES[0] * frames), 3), min(int(ONSET_SHARES[1] * frames), frames - 3) + 1)
+    n = np.diff(edges) * cuts[:, None].astype(float)
+    m = np.diff(edges) * (frames - cuts[:, None].astype(float))
+    first = before[cuts - 1] / cuts[:, None, None, None]
+    second = (before[-1] - before[cuts - 1]) / (frames - cuts)[:, None, None, None]
+    stronger = process + STRONGER_GRID[:, None, None] * gust  # (power, 1, band)
+    gains = nats(first, n, process) + nats(second, m, stronger).max(0)
+    gains -= nats(whole, found.counts, process + gust) + math.log(len(cuts))  # one of so many frames
+    if gains.max() <= 0:
+        return 0.0, None
+    at = int(np.argmax(gains))
+    return float(gains[at]), float(data.frame_time[cuts[at]] - 0.5 * data.hop_s)
+
+
+# inside ---------------------------------------------------------------------------------------------------------------
+def _tones(bin_hz: float) -> FloatArray:
+    """Tones (tone,) [Hz] on which spectra are integrated, of bins so far apart.
+
+    Even steps of 0.4 bins, as a bin's response has no structure finer than half of one; below, the spectra's own
+    resolution, one in twelve.
+    """
+    step = 0.4 * bin_hz
+    slow = np.exp(np.arange(math.log(5e-4), math.log(12 * step), math.log(13 / 12)))
+    return np.concatenate([[0.0], slow, np.arange(slow[-1] + step, 1.5 * SLOW_HZ, step)])
+
+
+def _log_normal(x: FloatArray, prior: tuple[float, float]) -> FloatArray:
+    """Log density of log x over its greatest one: on a grid the normalisation is the same for all."""
+    return -0.5 * (np.log(x / prior[0]) / prior[1]) ** 2
+
+
+def _one_channel(data: DriveData, variance: FloatArray, counts: FloatArray, power: FloatArray) -> FloatArray:
+    """Nats (..., band) of a `power` (..., band) in one channel, beside the most noise that its sensor can have.
+
+    White noise of a speed rises with f² in its difference, that of an acceleration is flat.
+    """
+    f = data.frequency[data.band_edges[: len(variance)]]
+    shape = f**2 if data.speed is not None else np.ones_like(f)
+    fast = f > SENSOR_ALONE_HZ
+    sensor = (variance[fast] / shape[fast]).min() * shape if fast.any() else 0.0 * shape
+    total = np.maximum(power, _POWER_FLOOR) + sensor
+    return -0.5 * counts * (np.log(total) + variance / total)

@@ -1,0 +1,164 @@
+r"""A quick density near the exact one, and the exact one with gradients from it that are corrected at random steps.
+
+The response is nearly linear in the coordinates, so quadratics in them are fitted to a hundred responses. Products of
+residuals in each band, and with them the whole likelihood, are then polynomials whose coefficients form one small Gram
+matrix a band, whatever the length of the drive.
+
+SGLD still targets the exact density: the surrogate is the control variate of its gradient. At one random step in
+`points` the difference to the exact gradient is added, times `points`. That is unbiased everywhere, with little noise
+where the surrogate is accurate; far from the mode the exact gradient is taken (Baker et al. 2019, for control variates
+of SGLD).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avtorch.arrays import FloatArray
+from avtorch.gap.engine.coordinates import INDEX
+from avtorch.gap.engine.density import HypothesisDensity, WithScore, log_prior, of_products, pairs
+from avtorch.inference.map import Mode
+
+
+@dataclass(frozen=True, eq=False)
+class Surrogate:
+    """`log_prob` of a `density` from quadratics in w, `x = centre + scale w`; `gram` (band, pair, term, term)."""
+
+    density: HypothesisDensity
+    centre: Tensor
+    scale: Tensor
+    gram: Tensor = field(repr=False)
+
+    windows = 1
+
+    @classmethod
+    def of(cls, density: HypothesisDensity, x: FloatArray) -> Surrogate:
+        """Fitted by least squares to responses at draws `x` (draw, coordinate) of roughly the posterior."""
+        h, data = density.hypothesis, density.hypothesis.data
+        centre = x.mean(0)
+        scale = np.linalg.cholesky(np.cov(x.T).reshape(len(centre), -1) + 1e-18 * np.eye(len(centre)))
+        terms = _terms(torch.as_tensor(np.linalg.solve(scale, (x - centre).T).T)).numpy()
+        weight = np.linalg.pinv(terms)
+        values, at = h.values.copy(), [INDEX[n] for n in density.names]
+        columns = np.zeros((len(weight), *data.measured.shape))
+        for k, own in enumerate(x):
+            values[at] = own
+            columns += np.multiply.outer(weight[:, k], data.measured - h.response(values))
+        gram = np.empty((data.band_count, len(pairs(data)), len(weight), len(weight)))
+        for b, (first, end) in enumerate(pairwise(data.band_edges.tolist())):
+            flat = columns[..., first:end].reshape(len(weight), data.channel_count, -1)
+            for p, (i, j) in enumerate(pairs(data)):
+                product = flat[:, i] @ flat[:, j].T
+                gram[b, p] = 0.5 * (product + product.T)
+        return cls(density, torch.as_tensor(centre), torch.as_tensor(scale), torch.as_tensor(gram))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.density.names
+
+    def initial(self) -> Tensor:
+        return self.density.unconstrain(self.centre)[None]
+
+    def constrain(self, z: Tensor) -> Tensor:
+        return self.density.constrain(z)
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        """Log density (..., 1) of `z` (..., 1, coordinate). Differentiable once."""
+        return cast(Tensor, WithScore.apply(z, self))
+
+    def value(self, z: Tensor) -> Tensor:
+        """`log_prob` without a graph."""
+        return self.expand(z)[0]
+
+    def score(self, z: Tensor) -> Tensor:
+        """Gradient of `log_prob`, the shape of `z`."""
+        return self.expand(z)[1]
+
+    def expand(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Log density (..., 1) and its gradient (..., 1, coordinate): products once, and their derivative from them."""
+        density, h = self.density, self.density.hypothesis
+        with torch.enable_grad():
+            z = z.detach().requires_grad_()
+            x = density.constrain(z)
+            away = (x - self.centre).unsqueeze(-1)
+            terms = _terms(torch.linalg.solve_triangular(self.scale, away, upper=False).squeeze(-1))
+            rest = log_prior(h, density.names, x) + density.log_slope(z).sum(-1)
+            half = torch.tensordot(terms.detach(), self.gram, ([-1], [-2]))  # (..., band, pair, term)
+            products = (half @ terms.detach()[..., None, :, None]).squeeze(-1).requires_grad_()
+            likelihood = density.temper * of_products(h.data, products.mT)
+            (slope,) = torch.autograd.grad(likelihood.sum(), products)
+            of_terms = 2 * (slope[..., None] * half).sum((-3, -2))
+            (score,) = torch.autograd.grad((terms * of_terms).sum() + rest.sum(), z)
+        return (likelihood + rest).detach(), score
+
+
+def terms_of(count: int) -> int:
+    """Number of terms of a quadratic in so many coordinates."""
+    return 1 + count + count * (count + 1) // 2
+
+
+def _terms(w: Tensor) -> Tensor:
+    first, second = torch.combinations(torch.arange(w.shape[-1]), with_replacement=True).T
+    return torch.cat([torch.ones_like(w[..., :1]), w, w[..., first] * w[..., second]], -1)
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """The `exact` density with minibatch estimates from the `surrogate`, corrected at one step in `points`.
+
+    All chains are corrected at the same step, as one call for many is cheap.
+    """
+
+    exact: HypothesisDensity
+    surrogate: Surrogate
+    mode: Mode
+    points: int
+
+    windows = 1
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.exact.names
+
+    def initial(self) -> Tensor:
+        return self.exact.initial()
+
+    def constrain(self, z: Tensor) -> Tensor:
+        return self.exact.constrain(z)
+
+    def approximation(self) -> Surrogate:
+        return self.surrogate
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        return self.exact.log_prob(z)
+
+    def score(self, z: Tensor) -> Tensor:
+        return self.exact.score(z)
+
+    def log_prob_minibatch(self, z: Tensor, index: Tensor) -> Tensor:
+        """Log density of `z` (..., 1, coordinate), its gradient unbiased over uniform `index` in 0 ... points - 1."""
+        flat = z.reshape(-1, z.shape[-1])
+        far = ~self.trusted(flat.detach())  # NaN counts as far
+        share = torch.where(far, 1.0, float((index == 0).sum()) * self.points / len(index))
+        value = torch.where(far, 0.0, self.surrogate.log_prob(flat))
+        chosen = share.nonzero().squeeze(-1)
+        if not len(chosen):
+            return value.reshape(z.shape[:-1])
+        apart = self.exact.log_prob(flat[chosen][:, None])[:, 0] - value[chosen]
+        return value.index_add(0, chosen, share[chosen] * apart).reshape(z.shape[:-1])
+
+    def trusted(self, z: Tensor) -> Tensor:
+        """Whether the surrogate's gradient may be used at `z` (chain, coordinate)."""
+        w = torch.linalg.solve_triangular(self.mode.scale[0], (z - self.mode.z[0])[..., None], upper=False)[..., 0]
+        return w.square().sum(-1) <= trusted_square(z.shape[-1])
+
+
+def trusted_square(size: int) -> float:
+    """Squared distance from the mode [posterior standard deviations] up to which a surrogate is used."""
+    return size + 4 * (2 * size) ** 0.5

@@ -1,0 +1,186 @@
+"""The plant of a hypothesis in torch: batched over values of its coordinates, differentiable, with onsets.
+
+It runs the simulator's own effects and actuator on the grid of a drive, stretch by stretch; a test holds it to the
+compiled plant. An effect that sets in later is neutral until then. One whose memory would have filled by then (a play,
+a sensor's filter) begins there at rest; an actuator that changes is cut in two there, and its second part begins at the
+acceleration which the first has reached.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.gap.effects import DrivelineOscillation
+from avtorch.gap.engine.car import table_effect
+from avtorch.gap.engine.compiled_plant import _FREE_DAMPING
+from avtorch.gap.engine.coordinates import EFFECTS, INDEX, NEUTRAL, Coordinate
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.simulator.actuator import Actuator, Substep
+from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.effect_context import EffectContext, context_at
+from avtorch.gap.simulator.order import at_place, in_order, substeps
+
+Values = Mapping[str, Tensor]
+"""Coordinates by name, (column,) each, or () where all columns share the value."""
+
+_FILLING = frozenset({"backlash", "sensor_lag"})
+_UNNAMED = "~linear"
+
+
+def own_value(c: Coordinate, z: Tensor) -> Tensor:
+    """The effect's own parameter at coordinates `z`: `Coordinate.value` of a tensor."""
+    if c.link == "inverse":
+        z = torch.where(z > 1e-9, 1 / z.clamp_min(1e-9), torch.inf)
+    elif c.link == "log":
+        z = z.exp()
+    elif c.link == "square":
+        z = z.clamp_min(1e-16).sqrt()  # its square, which acts, has a derivative at 0
+    elif c.link == "less one":
+        z = z + 1
+    return c.sign * z
+
+
+def not_in_torch(h: Hypothesis) -> str:
+    """Why there is no such plant of a hypothesis; empty where there is one."""
+    actuator = [e for e in h.effects if EFFECTS[e].base in ("second_order_actuator", "rate_limit")]
+    if len(actuator) > 1 and any(e in h.onsets for e in actuator):
+        return f"{' and '.join(actuator)} change the actuator at different times"
+    return ""
+
+
+@dataclass(frozen=True, eq=False)
+class _Stretch:
+    """Steps (grid,) of one stretch, and the car's acceleration at its first row [m/s²]."""
+
+    row: EffectContext
+    command: Tensor
+    accel0: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class TorchPlant:
+    """`Hypothesis.on_grid` for tensors of values; `acting`: effects, those of the user's baseline among them."""
+
+    hypothesis: Hypothesis
+    acting: tuple[str, ...]
+    stretches: tuple[_Stretch, ...]
+
+    @classmethod
+    def of(cls, h: Hypothesis) -> TorchPlant:
+        """Raises `InputError` where `not_in_torch` has a reason."""
+        why = not_in_torch(h)
+        if why:
+            raise InputError(f"hypothesis: {why}, needs one onset for both")
+        grid = h.data.grid
+        begins = np.flatnonzero(grid.starts).tolist()
+        command = h.command()[grid.row]
+        stretches = []
+        for i, j in zip(begins, [*begins[1:], len(grid.time)], strict=True):
+            time, none = torch.as_tensor(grid.time[i:j]), torch.zeros(1, dtype=torch.float64)
+            steps = time.diff()
+            uniform = bool((steps - steps.mean()).abs().max() <= 1e-6 * steps.mean())
+            dt = (time[-1] - time[0]) / (j - i - 1) if uniform else torch.cat([steps, steps[-1:]])
+            row = EffectContext(time, dt, torch.as_tensor(grid.speed[i:j]), None, none, none)
+            accel0 = torch.tensor(grid.accel0[i], dtype=torch.float64)
+            stretches.append(_Stretch(row, torch.as_tensor(command[i:j]), accel0))
+        return cls(h, tuple(_acting(h)), tuple(stretches))
+
+    def on_grid(self, values: Values) -> tuple[Tensor, Tensor]:
+        """The accelerometer's reading [m/s²] and the speed gained in its stretch [m/s], (column, grid) each.
+
+        `values`: every coordinate of the vector that differs from the hypothesis's, `T_L` among them.
+        """
+        parts = [self._over(stretch, values) for stretch in self.stretches]
+        accel, gained = zip(*parts, strict=True)
+        return torch.cat(accel, -1), torch.cat(gained, -1)
+
+    def _over(self, stretch: _Stretch, values: Values) -> tuple[Tensor, Tensor]:
+        steps, columns = len(stretch.command), values["T_L"].shape
+        row = replace(stretch.row, T_L=values["T_L"][..., None], K_L=values["K_L"][..., None])
+        late: dict[str, int] = {}
+        effects = []
+        for name in self.acting:
+            first = int(np.searchsorted(row.time.numpy(), self.hypothesis.onsets.get(name, -np.inf)))
+            if first < steps:
+                effects.append(self._effect(name, values, row.time, first))
+                late[effects[-1].name] = first
+        chain = in_order(effects)
+
+        def hook(e: Effect, x: Tensor) -> Any:
+            before = late[e.name] - 1
+            if before < 1 or e.name not in _FILLING:
+                return e.over(x, row)
+            rest = replace(row, time=row.time[before:], dt=row.dt[before:] if row.dt.dim() else row.dt)
+            after = e.over(x[..., before:], rest)
+            return torch.cat([x[..., :before].expand(*after.shape[:-1], -1), after], -1)
+
+        parts = substeps(chain, stretch.command, row, hook)
+        accel0, at = stretch.accel0.expand(columns), context_at(row, 0)
+        actuator0 = accel0
+        for e in at_place(chain, "body"):  # the actuator's share is the car's acceleration less the other forces
+            first = e.replaced({key: value[..., 0] for key, value in e.values().items()})
+            actuator0 = actuator0 - first.advance(accel0, at, first.start(accel0, at))[0]
+        a, gained = _actuated(actuator0, parts, chain, late, steps)
+        accel = a
+        for e in at_place(chain, "body"):
+            force = e.over(a, row)
+            accel = accel + force
+            gained = gained + 0.5 * (row.dt[:-1] if row.dt.dim() else row.dt) * (force[..., 1:] + force[..., :-1])
+        for e in at_place(chain, "sensor"):
+            accel = hook(e, accel)
+        zero = torch.zeros(*columns, 1, dtype=torch.float64)
+        return accel.expand(*columns, steps), torch.cat([zero, gained.expand(*columns, -1).cumsum(-1)], -1)
+
+    def _effect(self, name: str, values: Values, time: Tensor, first: int) -> Effect:
+        """The table's effect with values (column, 1), or (column, time) where it is neutral before a row `first`."""
+        coordinates = EFFECTS[name].coordinates
+        z = {c.name: values.get(c.name, torch.tensor(self.hypothesis[c.name])) for c in coordinates}
+        if name == _UNNAMED:
+            pole, frequency = (z[c.name][..., None] for c in coordinates)
+            zero = torch.zeros(1, dtype=torch.float64)
+            return DrivelineOscillation(frequency, zero, 2 * np.pi * frequency * pole, zero + _FREE_DAMPING)
+        effect = table_effect(self.hypothesis, name)
+        neutral = {p.name: p.neutral for p in effect.coordinates() if p.neutral is not None}
+        own = {c.parameter: own_value(c, z[c.name])[..., None] for c in coordinates}
+        if first and effect.name not in _FILLING and effect.own_onset is None:
+            acts = torch.arange(len(time)) >= first
+            own |= {k: torch.where(acts, own[k], x) for k, x in neutral.items() if k in own}
+        rest = {k: x[..., None] for k, x in effect.values().items() if k not in own}
+        return effect.replaced(rest | own)
+
+
+def _acting(h: Hypothesis) -> list[str]:
+    """The hypothesis's effects, and those of its baseline: what is not neutral in the vector."""
+    acting = [e for e in h.effects if e != "command_hold"]
+    fitted = {c.name for e in acting for c in EFFECTS[e].coordinates}
+    for effect in EFFECTS.values():
+        own = [c for c in effect.coordinates if c.mean is None]
+        names = {c.name for c in effect.coordinates}
+        if names & fitted or all(h[c.name] == NEUTRAL[INDEX[c.name]] for c in own):
+            continue
+        acting.append(effect.name)
+        fitted |= names
+    return acting
+
+
+def _actuated(
+    accel0: Tensor, parts: Sequence[Substep], chain: Sequence[Effect], late: Mapping[str, int], steps: int
+) -> tuple[Tensor, Tensor]:
+    """The actuator's acceleration (column, grid), and the speed gained in each step, (column, grid - 1)."""
+    own = [(late[e.name], e.actuator_parameters()) for e in chain]
+    cuts = {first for first, given in own if given and 0 < first < steps - 1}
+    accels, gains = [accel0[..., None]], []
+    for i, j in pairwise([0, *sorted(cuts), steps - 1]):
+        given = {key: x[..., -1:] for first, mine in own if first <= i for key, x in mine.items()}
+        a, gained = Actuator(**given).over(accels[-1][..., -1], [p.rows(slice(i, j + 1)) for p in parts])
+        accels.append(a[..., 1:])
+        gains.append(gained)
+    return torch.cat(accels, -1), torch.cat(gains, -1)

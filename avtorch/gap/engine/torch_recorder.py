@@ -1,0 +1,142 @@
+"""The recorder in torch: signals of the grid as coefficients of the channels, batched and differentiable.
+
+Twin of `Hypothesis.recorded` and `DriveData.transform`, with gradients in the signals and in delays and filters. The
+delay reads between points of the grid, so that the gradient in it jumps where a row passes one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, cast
+
+import numpy as np
+import torch
+from scipy.signal import lfilter
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.torch_plant import Values
+
+
+@dataclass(frozen=True, eq=False)
+class TorchRecorder:
+    """The recorder of `data`; tables of rows (row,) that its steps read."""
+
+    data: DriveData
+    grid_time: Tensor
+    time: Tensor
+    kept: Tensor
+    aligned: tuple[Tensor, Tensor]
+    span: Tensor
+    inner: Tensor
+
+    @classmethod
+    def of(cls, data: DriveData) -> TorchRecorder:
+        time, n = torch.as_tensor(data.time), len(data.time)
+        inner = np.arange(n)
+        inner[data.bounds[1:] - 1] -= 1
+        inner[data.bounds[:-1]] += 1
+        return cls(
+            data,
+            torch.as_tensor(data.grid.time),
+            time,
+            torch.as_tensor(data.held(np.arange(float(n)))).long(),
+            _between(time, time - data.align_s),
+            (time[2:] - time[:-2]).clamp_min(0.3 * data.dt),
+            torch.as_tensor(inner) - 1,
+        )
+
+    def response(self, accel: Tensor, gained: Tensor, values: Values) -> Tensor:
+        """Coefficients (column, channel, frame, bin) of a reading and a gained speed, (column, grid) each.
+
+        `values` holds each channel's delay and filter [s], (column,).
+        """
+        shown = []
+        if self.data.accel is not None:
+            a = self._low_pass(self._late(accel, values["accel_delay"]), values["accel_filter"])
+            index, share = self.aligned
+            shown.append(_read(a, index, share) if self.data.align_s else a)
+        if self.data.speed is not None:
+            v = self._low_pass(self._late(gained, values["speed_delay"]), values["speed_filter"])
+            v = v if self.data.hold == 1 else v[..., self.kept]
+            difference = (v[..., 2:] - v[..., :-2]) / self.span
+            shown.append(difference[..., self.inner])
+        return cast(Tensor, _Transform.apply(torch.stack(shown, -2), self.data))
+
+    def _late(self, x: Tensor, delay: Tensor) -> Tensor:
+        return _read(x, *_between(self.grid_time, self.time - delay[..., None]))
+
+    def _low_pass(self, x: Tensor, time_constant: Tensor) -> Tensor:
+        c = time_constant / (time_constant + self.data.dt)
+        return cast(Tensor, _OnePole.apply(x, torch.where(time_constant < 1e-4, 0.0, c), self.data))
+
+
+def _between(time: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """The point of `time` (point,) at or before each of `at`, and the share of the way to the next; 0 or 1 outside."""
+    index = (torch.searchsorted(time, at.detach().contiguous(), right=True) - 1).clamp(0, len(time) - 2)
+    begin = time[index]
+    return index, ((at - begin) / (time[index + 1] - begin)).clamp(0.0, 1.0)
+
+
+def _read(x: Tensor, index: Tensor, share: Tensor) -> Tensor:
+    """`x` (column, point) linearly between points."""
+    index = index.expand(*x.shape[:-1], index.shape[-1])
+    low = x.gather(-1, index)
+    return low + share * (x.gather(-1, index + 1) - low)
+
+
+class _OnePole(torch.autograd.Function):
+    """y[k] = c y[k-1] + (1 - c) x[k], from y = x at the start of a stretch on; x (column, row), c (column,)."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, c: Tensor, data: DriveData) -> Tensor:
+        rows, keep = x.detach().numpy(), c.detach().numpy()
+        y = np.empty_like(rows)
+        for column, own in enumerate(keep):
+            for i, j in pairwise(data.bounds):
+                head = rows[column, i]
+                y[column, i:j] = lfilter([1 - own], [1, -own], rows[column, i:j], zi=[own * head])[0]
+        ctx.x, ctx.y, ctx.keep, ctx.data = rows, y, keep, data
+        return torch.as_tensor(y)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        g, on_x, on_c = gradient.numpy(), np.empty_like(ctx.x), np.zeros(len(ctx.keep))
+        for column, own in enumerate(ctx.keep):
+            for i, j in pairwise(ctx.data.bounds):
+                costate = lfilter([1.0], [1, -own], g[column, i:j][::-1])[::-1]
+                on_x[column, i:j] = (1 - own) * costate
+                on_x[column, i] = costate[0]
+                on_c[column] += costate[1:] @ (ctx.y[column, i : j - 1] - ctx.x[column, i + 1 : j])
+        return torch.as_tensor(on_x), torch.as_tensor(on_c), None
+
+
+class _Transform(torch.autograd.Function):
+    """Rows (..., row) as coefficients (..., frame, bin), a linear map."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, data: DriveData) -> Tensor:
+        ctx.data = data
+        flat = data.transform(list(rows.detach().reshape(-1, rows.shape[-1]).numpy()))
+        return torch.as_tensor(flat).reshape(*rows.shape[:-1], *flat.shape[1:])
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return cast(Tensor, _Adjoint.apply(gradient, ctx.data)), None
+
+
+class _Adjoint(torch.autograd.Function):
+    """Coefficients (..., frame, bin) as rows (..., row), the transpose of `_Transform`."""
+
+    @staticmethod
+    def forward(ctx: Any, coefficients: Tensor, data: DriveData) -> Tensor:
+        ctx.data = data
+        flat = coefficients.detach().reshape(-1, *coefficients.shape[-2:]).numpy()
+        return torch.as_tensor(np.stack([data.adjoint(x) for x in flat])).reshape(*coefficients.shape[:-2], -1)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return cast(Tensor, _Transform.apply(gradient, ctx.data)), None

@@ -1,0 +1,274 @@
+"""Free forms: laws of their responses and of their evidence, and known causes found by the right family."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
+
+from avtorch import Log
+from avtorch.arrays import FloatArray
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.free_forms import (
+    TONE_HZ,
+    FreeForm,
+    _between_bins,
+    _first_order_backwards,
+    band_products,
+    block,
+    demand_response,
+    families,
+    first_order,
+    mirror_columns,
+    tone,
+    wandering,
+)
+from avtorch.gap.engine.gauss_newton import fit, jacobian, prior_terms, whitened_jacobian
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.likelihood import whiten
+
+DT, SECONDS, LAG, GAIN = 0.02, 150.0, 0.4, 0.9
+ACCEL_SD, SPEED_SD = 0.1, 0.03
+
+Force = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def _lagged(x: FloatArray) -> FloatArray:
+    keep = math.exp(-DT / LAG)
+    return lfilter([0.0, 1.0 - keep], [1.0, -keep], x, zi=[x[0]])[0]
+
+
+def _lags(time: FloatArray, u: FloatArray) -> FloatArray:
+    return _lagged(GAIN * u)
+
+
+def _cubic(time: FloatArray, u: FloatArray) -> FloatArray:
+    return _lagged(GAIN * (u + 0.15 * u * np.abs(u)))
+
+
+def _weaker_drive(time: FloatArray, u: FloatArray) -> FloatArray:
+    return _lagged(GAIN * np.where(u > 0, 0.8 * u, u))
+
+
+def _two_lags(time: FloatArray, u: FloatArray) -> FloatArray:
+    slow = lfilter([DT / 3.0], [1.0, DT / 3.0 - 1.0], u)
+    return _lagged(GAIN * (0.7 * u + 0.3 * slow))
+
+
+def _wandering_gain(time: FloatArray, u: FloatArray) -> FloatArray:
+    return _lagged(GAIN * u * (1.0 + 0.25 * np.sin(2 * np.pi * time / 60.0)))
+
+
+def _wandering_delay(time: FloatArray, u: FloatArray) -> FloatArray:
+    late = 0.1 + 0.1 * np.sin(2 * np.pi * time / 60.0)
+    return np.interp(time - late, time, _lagged(GAIN * u))
+
+
+def _ringing(time: FloatArray, u: FloatArray) -> FloatArray:
+    return _lagged(GAIN * u) + 0.05 * np.sin(2 * np.pi * 0.7137 * time)
+
+
+def _foreseeing(time: FloatArray, u: FloatArray) -> FloatArray:
+    return 0.8 * _lagged(GAIN * u) + 0.2 * _lagged(GAIN * u[::-1])[::-1]
+
+
+@cache
+def _car(response: Force, channels: tuple[str, ...] = ("accel", "speed"), seed: int = 0) -> Hypothesis:
+    """The hypothesis without effects, fitted to a car with this response to an open-loop command."""
+    random = np.random.default_rng(seed)
+    time = np.arange(0.0, SECONDS, DT)
+    command = gaussian_filter1d(np.repeat(random.normal(0.0, 1.3, len(time)), 150)[: len(time)], 20)
+    command -= command.mean()
+    accel = response(time, command)
+    speed = 40.0 + np.cumsum(np.append(0.0, 0.5 * (accel[1:] + accel[:-1]))) * DT
+    speed += 20.0 - speed.min()  # never near standstill
+    readings = {
+        "accel": accel + random.normal(0.0, ACCEL_SD, len(time)),
+        "speed": speed + random.normal(0.0, SPEED_SD, len(time)),
+    }
+    data = DriveData.of(Log.from_arrays(time=time, accel_cmd=command, **{c: readings[c] for c in channels}))
+    h = fit(Hypothesis(data), 12)
+    h.jacobian = jacobian(h, h.free)
+    whitened = whitened_jacobian(h, h.jacobian)
+    h.information = whitened @ whitened.T + np.diag(prior_terms(h, h.free)[0])
+    return h
+
+
+# responses ---------------------------------------------------------------------------------------------------------
+def test_lag_follows_a_step_as_its_equation_says() -> None:
+    time = np.arange(0.0, 5.0, DT)
+    step = (time >= 1.0 - 1e-9).astype(float)
+    accel, speed = first_order(time, time == 0.0, step, LAG)
+    since = np.maximum(time - 1.0, 0.0)
+    np.testing.assert_allclose(accel, 1.0 - np.exp(-since / LAG), atol=1e-12)
+    np.testing.assert_allclose(speed, since - LAG * (1.0 - np.exp(-since / LAG)), atol=1e-12)
+
+
+def test_each_stretch_begins_anew(fresh_seed: int) -> None:
+    demand = np.random.default_rng(fresh_seed).normal(size=100)
+    time = np.arange(100) * DT
+    starts = np.zeros(100, bool)
+    starts[[0, 40]] = True
+    accel, speed = first_order(time, starts, demand, LAG)
+    alone = first_order(time[40:], starts[40:], demand[40:], LAG)
+    np.testing.assert_allclose(accel[40:], alone[0])
+    np.testing.assert_allclose(speed[40:], alone[1])
+    assert accel[40] == demand[40]
+    assert speed[40] == 0.0
+
+
+def test_backwards_is_forwards_in_the_mirror(fresh_seed: int) -> None:
+    """A held demand turned around is one held from the other end."""
+    random = np.random.default_rng(fresh_seed)
+    held, time = random.normal(size=99), np.arange(100) * DT
+    starts = np.arange(100) == 0
+    forwards, gained = first_order(time, starts, np.append(held[::-1], held[0]), LAG)
+    accel, speed = _first_order_backwards(time, starts, np.append(held, 0.0), LAG)
+    np.testing.assert_allclose(accel[::-1], forwards, atol=1e-12)
+    # its integral: as much speed is gained from any row to the end
+    np.testing.assert_allclose(speed[-1] - speed[::-1], gained, atol=1e-12)
+
+
+@pytest.mark.parametrize("channels", [("accel", "speed"), ("speed",), ("accel",)], ids="+".join)
+def test_demand_of_the_command_is_the_cars_own_response(channels: tuple[str, ...]) -> None:
+    """Without effects the car is a lag behind K u, seen by the same recorder: what is left is the start's transient,
+    of which exp(-4 s / T) is left after warming up."""
+    h = _car(_lags, channels)
+    own = demand_response(h, h["K_L"] * h.command()[None], np.array([h["T_L"]]))[0]
+    assert np.linalg.norm(own - h.predicted) < 10 * math.exp(-4.0 / h["T_L"]) * np.linalg.norm(own)
+
+
+def test_a_dead_time_delays_every_demand() -> None:
+    h = _car(_lags).copy()
+    h["dead_time"] = 0.2
+    late = demand_response(h, h["K_L"] * h.command()[None], np.array([h["T_L"]]))[0]
+    assert np.linalg.norm(late - h.response()) < 1e-3 * np.linalg.norm(late)
+
+
+# evidence ----------------------------------------------------------------------------------------------------------
+def test_band_products_give_every_whitened_product(fresh_seed: int) -> None:
+    h = _car(_lags)
+    x = np.random.default_rng(fresh_seed).normal(size=(3, *h.residual.shape))
+    weighted = np.tensordot(np.linalg.inv(h.covariance), band_products(h.data, x), 3)
+    flat = np.array([whiten(h.data, h.covariance, y) for y in x])
+    np.testing.assert_allclose(weighted, flat @ flat.T, rtol=1e-9, atol=1e-6)
+
+
+def test_evidence_does_not_depend_on_the_basis(fresh_seed: int) -> None:
+    """A rotation of a form's coefficients leaves their prior as it is, and so their evidence."""
+    h = _car(_cubic)
+    form = families(h)["sided"]
+    rotation = np.linalg.qr(np.random.default_rng(fresh_seed).normal(size=(4, 4)))[0]
+    turned = FreeForm("sided", "dynamics", np.tensordot(rotation, form.columns, 1), form.terms)
+    one, other = block(h, form), block(h, turned)
+    assert other.nats == pytest.approx(one.nats, abs=1e-6)
+    np.testing.assert_allclose(other.coefficients, rotation @ one.coefficients, atol=1e-6)
+
+
+def test_what_the_parameters_already_do_gains_nothing() -> None:
+    """A form in the span of the Jacobian: its coefficient and the gain's own share what little is left. The gain's sd
+    is 0.5; with another 0.35 beside it, the prior is wider, and the posterior as narrow."""
+    h = _car(_lags)
+    again = FreeForm("gain", "force map", h.jacobian[h.free.index("K_L")][None], ("K_L",))
+    found = block(h, again)
+    wider = 0.5 * math.log(1.0 + (0.35 / 0.5) ** 2)
+    assert found.nats == pytest.approx(-wider, abs=0.2)  # what the prior's mean is away from the fit
+
+
+def test_residual_is_what_the_coefficients_leave() -> None:
+    h = _car(_cubic)
+    form = families(h)["map"]
+    found = block(h, form)
+    assert found.residual is not None
+    explained = h.residual - found.residual - np.tensordot(found.coefficients, form.columns, 1)
+    flat = explained.ravel()
+    basis = h.jacobian.reshape(len(h.jacobian), -1)
+    left = flat - basis.T @ np.linalg.lstsq(basis.T, flat, rcond=None)[0]
+    assert np.linalg.norm(left) < 1e-6 * np.linalg.norm(flat)
+
+
+@pytest.mark.parametrize("channels", [("accel", "speed"), ("speed",), ("accel",)], ids="+".join)
+def test_nothing_is_found_where_nothing_is_missing(channels: tuple[str, ...]) -> None:
+    """Every coefficient that could be seen and is not there costs its logarithm of how well it was seen."""
+    h = _car(_lags, channels)
+    forms = families(h)
+    assert set(forms) == ({"linear", "sided", "map"} if "speed" in channels else {"linear", "sided"})
+    fits = [block(h, f) for f in [*forms.values(), mirror_columns(h)]]
+    fits += [*wandering(h).values(), tone(h).fit]
+    assert max(f.nats for f in fits) < 0.0
+
+
+@pytest.mark.parametrize(
+    ("response", "family"),
+    [(_cubic, "map"), (_weaker_drive, "sided"), (_two_lags, "linear")],
+    ids=["cubic", "weaker drive", "two lags"],
+)
+def test_the_family_of_the_cause_gains_most(response: Force, family: str) -> None:
+    """The gain of one side is a map, too, but a sided form of fewer coefficients. Gains are hundreds of nats."""
+    h = _car(response)
+    nats = {name: block(h, form).nats for name, form in families(h).items()}
+    nats |= {name: found.nats for name, found in wandering(h).items()}
+    assert max(nats, key=lambda name: nats[name]) == family
+    assert nats[family] > 20.0
+
+
+def test_an_answer_before_the_command_is_the_mirrors() -> None:
+    h = _car(_foreseeing)
+    assert block(h, mirror_columns(h)).nats > block(h, families(h)["linear"]).nats + 20.0
+
+
+@pytest.mark.parametrize(
+    ("response", "kind", "size"),
+    [(_wandering_gain, "gain", 0.25), (_wandering_delay, "delay", 0.1)],
+    ids=["gain", "delay"],
+)
+def test_a_course_that_wanders_is_found_again(response: Force, kind: str, size: float) -> None:
+    """Its course is a sine of 60 s in frames of 5 s. The frames' overlap smooths a few per cent away; the prior pulls
+    frames in which the command hardly moves to 0, up to a quarter of the whole in some drives."""
+    h = _car(response)
+    found = wandering(h)
+    assert found[kind].nats > 20.0
+    assert max(found, key=lambda k: found[k].nats) == kind
+    course = found[kind].coefficients
+    assert course.sum() == pytest.approx(0.0, abs=1e-9)
+    truth = size * np.sin(2 * np.pi * h.data.frame_time / 60.0)
+    truth -= truth.mean()
+    assert np.corrcoef(course, truth)[0, 1] > 0.95
+    assert np.std(course) == pytest.approx(np.std(truth), rel=0.3)
+
+
+def test_a_tone_is_found_with_frequency_and_size() -> None:
+    h = _car(_ringing)
+    found = tone(h)
+    assert found.fit.nats > 20.0
+    # Cramer and Rao: sd of a frequency sqrt(6) / (pi T^1.5 amplitude) sqrt(noise's density)
+    density = ACCEL_SD**2 * DT * 2
+    bound = math.sqrt(6 * density) / (math.pi * 146.0**1.5 * 0.05)
+    # Hann's window and interpolation double it
+    assert found.frequency == pytest.approx(0.7137, abs=10 * bound)
+    assert found.channel in h.data.channels
+    size = np.hypot(*found.fit.coefficients[:2])
+    assert size == pytest.approx(0.05, abs=5 * math.sqrt(density / 146.0) * 2)
+
+
+def test_tones_above_those_of_loops_are_left_alone() -> None:
+    assert tone(_car(_ringing), 0.8).fit.nats < 0.0
+    h = _car(_lags)
+    assert tone(h).frequency < TONE_HZ
+    low = fit(Hypothesis(h.data.below(1.3), alone=True), 12)
+    low.jacobian = jacobian(low, low.free)
+    low.information = np.eye(len(low.free))  # of no account for the frequency
+    assert tone(low).frequency < 1.3
+
+
+def test_line_between_bins_is_exact_for_a_hann_window(fresh_seed: int) -> None:
+    random = np.random.default_rng(fresh_seed)
+    n, bin_number, shift = 4000, 300, float(random.uniform(-0.49, 0.49))
+    wave = np.cos(2 * np.pi * (bin_number + shift) * np.arange(n) / n + random.uniform(0, 6))
+    power = np.abs(np.fft.rfft(wave * np.hanning(n))) ** 2
+    assert _between_bins(power[bin_number - 1 : bin_number + 2]) == pytest.approx(shift, abs=2e-3)

@@ -1,0 +1,261 @@
+"""Slow forces: spectra and likelihoods by their laws, forces of known size recovered."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.signal import lfilter
+
+from avtorch import Log
+from avtorch.arrays import FloatArray
+from avtorch.gap.engine.coordinates import INDEX, NEUTRAL
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.priors import SLOW_HZ
+from avtorch.gap.engine.slow_forces import (
+    GUST_TIME_GRID_S,
+    SIZE_GRID_MPS2,
+    band_covariance,
+    band_response,
+    gust_onset,
+    gust_spectrum,
+    process_spectrum,
+    pulling_lags,
+    road_spectrum,
+    slow_forces,
+    wishart_log_likelihood,
+    wishart_profile,
+)
+from tests.bars import BAR, log_odds
+
+RATE_HZ = 20
+SPEED_MPS = 15.0
+T_L = float(NEUTRAL[INDEX["T_L"]])
+
+
+def _data(seconds: float, channels: tuple[str, ...] = ("accel", "speed")) -> DriveData:
+    """A drive whose shape alone counts."""
+    time = np.arange(0.0, seconds, 1 / RATE_HZ)
+    wave = np.sin(2 * np.pi * time / 10)
+    columns = {"accel": wave, "speed": SPEED_MPS - np.cos(2 * np.pi * time / 10) * 10 / (2 * np.pi)}
+    return DriveData.of(Log.from_arrays(time=time, accel_cmd=wave, **{name: columns[name] for name in channels}))
+
+
+def _ornstein_uhlenbeck(rng: np.random.Generator, rows: int, time_s: float) -> FloatArray:
+    """(row,) of variance 1, stationary from the first row on."""
+    c = np.exp(-1 / (RATE_HZ * time_s))
+    return lfilter([np.sqrt(1 - c * c)], [1, -c], rng.normal(size=rows), zi=[c * rng.normal()])[0]
+
+
+def _process_noise(rng: np.random.Generator, rows: int, q: float) -> FloatArray:
+    return q * np.sqrt(T_L / 2) * _ornstein_uhlenbeck(rng, rows, T_L)
+
+
+def _residual(data: DriveData, rng: np.random.Generator, force: FloatArray) -> FloatArray:
+    """The force in all channels; white noise of the acceleration, and of the speed before its difference."""
+    rows = len(data.time)
+    sensors = {"accel": 0.05 * rng.normal(size=rows), "speed": data.speed_difference(0.01 * rng.normal(size=rows))}
+    return data.transform([force + sensors[name] for name in data.channels])
+
+
+# spectra and the transform --------------------------------------------------------------------------------------------
+def test_spectra_have_the_variance_of_their_process() -> None:
+    # the variance of white jerk behind a lag is q² T / 2
+    of = {"gust": 1.0, "process": T_L / 2}
+    spectra = {"gust": lambda f: gust_spectrum(f, 1.7), "process": lambda f: process_spectrum(f, T_L)}
+    for name, spectrum in spectra.items():
+        total = quad(lambda f, s=spectrum: float(s(np.array([f]))[0]), 0, np.inf)[0]
+        assert total == pytest.approx(of[name], rel=1e-6)  # accuracy of the quadrature
+    total = quad(lambda f: float(road_spectrum(np.array([f]), 0.05)[0]), 0, np.inf)[0]
+    assert total == pytest.approx(1, rel=1e-6)
+
+
+def test_a_second_pole_leaves_the_variance_of_white_jerk() -> None:
+    # x a'' + T a' + a = 0 under white jerk: Lyapunov's equation gives q² (T / 2 + x / (2 T))
+    x = 0.04
+    total = quad(lambda f: float(process_spectrum(np.array([f]), T_L, x)[0]), 0, np.inf, limit=200)[0]
+    assert total == pytest.approx(T_L / 2 + x / (2 * T_L), rel=1e-6)
+
+
+def test_white_noise_has_one_level_in_all_bands() -> None:
+    data = _data(120)
+    response = band_response(data)
+    below = data.frequency[data.band_edges[1 : len(response.energy) + 1] - 1] < SLOW_HZ
+    level = response.energy.sum(1) * 2 / RATE_HZ  # spectrum of white noise of variance 1
+    # the transform is orthonormal; 0.5 %: the grid of tones where it changes its pace
+    assert np.allclose(level[below], 1, atol=0.005)
+
+
+@pytest.mark.statistical
+def test_the_response_is_the_mean_square_of_coefficients(rotating_seed: int, draws_factor: int) -> None:
+    rng, data = np.random.default_rng(rotating_seed), _data(300)
+    response = band_response(data)
+    n, repeats = len(response.energy), 24 * draws_factor
+    each = []
+    for _ in range(repeats):
+        x = data.transform([_ornstein_uhlenbeck(rng, len(data.time), 2.0)])
+        each.append(band_covariance(_data(300, ("accel",)), x)[0][:n, 0, 0])
+    expected = response.energy @ gust_spectrum(response.frequency, 2.0)
+    error = np.std(each, axis=0, ddof=1) / np.sqrt(repeats)
+    # rows in place of continuous time: a spectrum that is repeated at the rate of the rows, seen below 2 of 20 Hz
+    assert (np.abs(np.mean(each, axis=0) / expected - 1) < BAR * error / expected + 0.04).all()
+
+
+# the likelihood of a common power -------------------------------------------------------------------------------------
+def _covariances(rng: np.random.Generator, count: int) -> FloatArray:
+    """Sample covariances (count, 2, 2) of all shapes and sizes."""
+    root = np.tril(rng.normal(size=(count, 2, 2))) * np.exp(rng.normal(size=(count, 2, 1)))
+    return root @ root.swapaxes(1, 2)
+
+
+def test_no_sensors_fit_better_than_those_of_the_profile(fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
+    S, counts = _covariances(rng, 40), np.full(40, 2.0)
+    power = np.exp(rng.normal(-1, 1.5, (3, 40))) * np.sqrt(S[:, 0, 0] * S[:, 1, 1])
+    nats, variances = wishart_profile(S, counts, power)
+    assert np.allclose(nats, wishart_log_likelihood(S, counts, power, variances), rtol=1e-9)
+    grid = np.geomspace(1e-4, 30, 40)
+    a, c = np.meshgrid(grid, grid, indexing="ij")
+    tried = np.stack([a[..., None, None] * S[:, 0, 0], c[..., None, None] * S[:, 1, 1]], -1)
+    others = wishart_log_likelihood(S, counts, power, tried)
+    assert (others <= nats + 1e-9 * np.abs(nats) + 1e-9).all()
+
+
+def test_the_common_power_of_a_sample_covariance_explains_it(fresh_seed: int) -> None:
+    S = _covariances(np.random.default_rng(fresh_seed), 200)
+    # a common power that both channels may have: their covariance, less than either variance
+    S = S[(S[:, 0, 1] > 0) & (S[:, 0, 1] < 0.99 * np.minimum(S[:, 0, 0], S[:, 1, 1]))]
+    nats, variances = wishart_profile(S, np.ones(len(S)), S[:, 0, 1])
+    assert np.allclose(nats, -0.5 * (np.linalg.slogdet(S)[1] + 2), atol=1e-9)
+    assert np.allclose(variances, S[:, [0, 1], [0, 1]] - S[:, 0, 1][:, None], rtol=1e-6, atol=1e-9 * S.max())
+
+
+def test_channels_and_units_are_exchangeable(fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
+    S, counts, power = _covariances(rng, 30), rng.uniform(1, 50, 30), np.exp(rng.normal(size=(2, 30)))
+    nats, variances = wishart_profile(S, counts, power)
+    swapped, others = wishart_profile(S[:, ::-1, ::-1], counts, power)
+    assert np.allclose(nats, swapped, rtol=1e-9)
+    assert np.allclose(variances, others[..., ::-1], rtol=1e-6)
+    assert np.allclose(wishart_profile(9 * S, counts, 9 * power)[0], nats - counts * np.log(9), rtol=1e-9)
+
+
+def test_counts_and_covariances_of_frames_add_up(fresh_seed: int) -> None:
+    data = _data(200)
+    x = np.random.default_rng(fresh_seed).normal(size=data.measured.shape)
+    whole, n = band_covariance(data, x)
+    first, n1 = band_covariance(data, x, slice(0, 7))
+    second, n2 = band_covariance(data, x, slice(7, None))
+    assert np.allclose(n, n1 + n2)
+    assert np.allclose(n[:, None, None] * whole, n1[:, None, None] * first + n2[:, None, None] * second)
+    assert (n == data.band_size).all()
+
+
+# forces of known size -------------------------------------------------------------------------------------------------
+@pytest.mark.statistical
+def test_a_gust_is_found_and_measured(rotating_seed: int) -> None:
+    rng, data = np.random.default_rng(rotating_seed), _data(900)
+    rows = len(data.time)
+    found = []
+    for _ in range(8):
+        force = 0.2 * _ornstein_uhlenbeck(rng, rows, 2.0) + _process_noise(rng, rows, 0.04)
+        found.append(slow_forces(data, _residual(data, rng, force), NEUTRAL))
+    # neither process noise nor a road has the spectrum of a process of 2 s
+    gusts, roads = np.array([f.gust for f in found]), np.array([f.road for f in found])
+    assert (gusts > log_odds()).all()
+    assert (gusts > roads).all()
+    # 450 correlation times tell a size to 5 %; a step of the grid is 28 % of a size, and 50 % of a time
+    sizes, times = np.array([f.gust_sd for f in found]), np.array([f.gust_time for f in found])
+    step = np.log(SIZE_GRID_MPS2[1] / SIZE_GRID_MPS2[0])
+    assert np.abs(np.log(sizes / 0.2)).mean() < step
+    assert abs(np.log(times / 2.0).mean()) < np.log(GUST_TIME_GRID_S[1:] / GUST_TIME_GRID_S[:-1]).max()
+
+
+@pytest.mark.statistical
+def test_without_a_gust_the_best_one_gains_nothing(rotating_seed: int) -> None:
+    rng, data = np.random.default_rng(rotating_seed), _data(600)
+    rows = len(data.time)
+    for q in (0.0, 0.03, 0.1):
+        found = slow_forces(data, _residual(data, rng, _process_noise(rng, rows, q)), NEUTRAL)
+        # of 112 gusts and 80 roads beside five sizes of process noise the best; grids are coarse by half a nat
+        assert max(found.gust, found.road) < log_odds(5 * 192) + 0.5
+
+
+@pytest.mark.statistical
+def test_a_road_is_told_from_a_gust_by_the_end_of_its_spectrum(rotating_seed: int) -> None:
+    rng, data = np.random.default_rng(rotating_seed), _data(900)
+    rows, f = len(data.time), np.fft.rfftfreq(len(data.time), 1 / RATE_HZ)
+    for _ in range(3):
+        slope = np.fft.irfft(np.fft.rfft(rng.normal(size=rows)) * (f < SPEED_MPS / 420), rows)
+        force = 0.3 * slope / slope.std() + _process_noise(rng, rows, 0.03)
+        found = slow_forces(data, _residual(data, rng, force), NEUTRAL)
+        assert found.road > found.gust
+        assert found.road > log_odds()
+        # a flat spectrum up to 0.036 Hz in 900 s: 64 squares, a size to 9 %, and a step of the grid
+        assert found.road_sd == pytest.approx(0.3, rel=0.28 + BAR * 0.09)
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("channel", ["accel", "speed"])
+def test_one_channel_shows_a_strong_gust(channel: str, rotating_seed: int) -> None:
+    rng, data = np.random.default_rng(rotating_seed), _data(600, (channel,))
+    force = 0.3 * _ornstein_uhlenbeck(rng, len(data.time), 2.2)
+    found = slow_forces(data, _residual(data, rng, force), NEUTRAL)
+    assert found.gust > log_odds()
+    # 270 correlation times: 6 %, and a step of the grid
+    assert found.gust_sd == pytest.approx(0.3, rel=0.28 + BAR * 0.06)
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("channels", [("accel", "speed"), ("speed",)])
+def test_a_gust_that_sets_in_tells_when(channels: tuple[str, ...], rotating_seed: int) -> None:
+    rng, data = np.random.default_rng(rotating_seed), _data(600, channels)
+    onset = 330.0
+    force = 0.4 * _ornstein_uhlenbeck(rng, len(data.time), 1.5) * (data.time > onset)
+    residual = _residual(data, rng, force)
+    nats, when = gust_onset(data, residual, slow_forces(data, residual, NEUTRAL))
+    assert nats > log_odds(data.frame_count)
+    assert when is not None
+    assert abs(when - onset) < 2 * data.hop_s  # a frame
+
+
+@pytest.mark.statistical
+def test_a_gust_that_blows_throughout_has_no_onset(rotating_seed: int) -> None:
+    rng, data = np.random.default_rng(rotating_seed), _data(600)
+    residual = _residual(data, rng, 0.3 * _ornstein_uhlenbeck(rng, len(data.time), 1.5))
+    assert gust_onset(data, residual, slow_forces(data, residual, NEUTRAL))[0] < log_odds(3 * data.frame_count)
+
+
+def test_short_drives_have_no_onset(fresh_seed: int) -> None:
+    rng, data = np.random.default_rng(fresh_seed), _data(40)
+    residual = _residual(data, rng, np.zeros(len(data.time)))
+    assert data.frame_count < 10
+    assert gust_onset(data, residual, slow_forces(data, residual, NEUTRAL)) == (0.0, None)
+
+
+def test_what_is_given_replaces_the_residuals(fresh_seed: int) -> None:
+    rng, data = np.random.default_rng(fresh_seed), _data(200)
+    residual = _residual(data, rng, 0.1 * _ornstein_uhlenbeck(rng, len(data.time), 2.0))
+    S, n = band_covariance(data, residual)
+    own, given = slow_forces(data, residual, NEUTRAL), slow_forces(data, 0 * residual, NEUTRAL, given=(S, n))
+    assert (own.log_likelihood, own.gust, own.road) == (given.log_likelihood, given.gust, given.road)
+    # all channels at once may be no better than the law of each band's own covariance
+    free = -0.5 * (n * (np.linalg.slogdet(S)[1] + 2))[: own.bands].sum()
+    assert own.log_likelihood + max(own.gust, own.road, 0.0) < free
+
+
+# lags of an actuator at its limit -------------------------------------------------------------------------------------
+def test_an_actuator_at_its_limit_pulls_less() -> None:
+    data = _data(60)
+    free = Hypothesis(data)
+    assert pulling_lags(free).tolist() == [T_L]
+    # steepest demand: 2 pi / 10 m/s³; limits from never reached to reached nearly always
+    shares = []
+    for jerk in (1.0, 0.5, 0.1):
+        lags = pulling_lags(free.with_effect("rate_limit", (1 / jerk,)))
+        assert lags[0] == pytest.approx(T_L)
+        shares.append((lags[1] / T_L - 1) / (2 - 1))
+        assert np.allclose(lags, T_L * (1 + shares[-1] * (2.0 ** np.arange(len(lags)) - 1)))
+    assert shares[0] == pytest.approx(0, abs=1e-9)
+    assert 0.2 < shares[1] < shares[2] < 1
