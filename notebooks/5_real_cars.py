@@ -105,8 +105,8 @@ if there(*LAPS):
     among = ["brake_throttle_asymmetry", "constant_resistance", "dead_time", "second_order_actuator"]
     with TemporaryDirectory() as folder:
         kept = Path(folder) / "fits.json"
-        as_it_is = avtorch.diagnose(laps, effects=among, pairs=False, checkpoint=kept)
-        named = avtorch.diagnose(laps, effects=among, pairs=False, checkpoint=kept, prior={"unknown": 0})
+        as_it_is = avtorch.diagnose(laps, effects=among, pairs=False)
+        named = avtorch.diagnose(laps, effects=among, pairs=False, prior={"unknown": 0})
     print(f"as usual: {as_it_is.verdict.name}, probability {as_it_is.winner.probability:.2f}")
     print(f"without unknown: {named.verdict.name}, probability {named.winner.probability:.2f}", end="; ")
     print(", ".join(f"{name} {q.mean:.2f} ({q.q05:.2f} to {q.q95:.2f})" for name, q in named.winner.parameters.items()))

@@ -19,7 +19,6 @@ from avtorch.cli.diagnosis_table import budget_table, diagnosis_headline, diagno
 from avtorch.cli.follower import follow, refuse
 from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.pedals import commanded, write_pedals
-from avtorch.cli.resume import EARLIER_FITS, FITS, begin_anew
 from avtorch.cli.simulator import read_simulator
 from avtorch.cli.talk import Talk
 from avtorch.cli.tested_simulator import simulator_of
@@ -129,7 +128,6 @@ def diagnose(
         Parameter(group=FOLLOWER, help="The assumed controller; default: the one that predicts better."),
     ] = None,
     event: Annotated[int | None, Parameter(group=FOLLOWER, help="Which event of an NGSIM file.")] = None,
-    resume: Annotated[bool, Parameter(help="Resume an interrupted run in --out, or start again.")] = True,
     speed_min: Annotated[
         float | None, Parameter(group=TRACK, help="Lowest speed of the next experiment [m/s]; default: as in the log.")
     ] = None,
@@ -151,8 +149,7 @@ def diagnose(
 ) -> None:
     """What does the simulator lack? Names the effect, its parameters, and what the log cannot distinguish.
 
-    Writes diagnosis.json and plant.toml, the repaired simulator. Give the command again to resume a run that was
-    interrupted or ended by its --budget.
+    Writes diagnosis.json and plant.toml, the repaired simulator.
 
     Parameters
     ----------
@@ -213,8 +210,6 @@ def diagnose(
     own = simulator_of(
         simulated or (), simulator, step, with_paths, adjust=adjust or (), rollouts=rollouts, processes=processes
     )
-    if not resume:
-        begin_anew(out, FITS, EARLIER_FITS)
     quality = []
     for drive in drives:
         noted = check(drive).notes
@@ -243,27 +238,20 @@ def diagnose(
     )
     from avtorch.gap.diagnose import diagnose as work
 
-    try:
-        with talk.whole("Diagnosing", budget) as done:
-            found = work(
-                drives,
-                baseline=own or assumed,
-                prior=weights or None,
-                accel_kind=accel_kind,
-                effects=chosen,
-                pairs=pairs,
-                posterior=posterior,
-                budget_s=budget,
-                material=material,
-                seed=seed,
-                progress=done,
-                checkpoint=out / FITS,
-            )
-    except KeyboardInterrupt:
-        if (out / FITS).exists():
-            message = f"no answer was written; finished fits are kept in {out / FITS}: the same command resumes there"
-            raise KeyboardInterrupt(message) from None
-        raise
+    with talk.whole("Diagnosing", budget) as done:
+        found = work(
+            drives,
+            baseline=own or assumed,
+            prior=weights or None,
+            accel_kind=accel_kind,
+            effects=chosen,
+            pairs=pairs,
+            posterior=posterior,
+            budget_s=budget,
+            material=material,
+            seed=seed,
+            progress=done,
+        )
     from avtorch.remedy import setting_for, write_exports
 
     setting = setting_for(found, [x for drive in drives if drive.accel_cmd is not None for x in drive.accel_cmd])

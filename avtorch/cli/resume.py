@@ -1,4 +1,4 @@
-"""Going on with an interrupted diagnosis or estimate, or beginning anew: the fits or windows that were finished."""
+"""Going on with an interrupted estimate, or beginning anew: the windows that were finished."""
 
 from __future__ import annotations
 
@@ -6,14 +6,9 @@ from pathlib import Path
 
 from avtorch.errors import InputError
 
-FITS = "fits.json"
-"""Finished fits. The diagnosis keeps them and compares their fingerprint with that of its logs and settings."""
-
 WINDOWS = "windows.state"
-"""Finished windows, and the belief behind them. The estimate keeps them and compares what they belong to likewise."""
-
-EARLIER_FITS = "fits_of.json"
-"""Written beside the fits until 0.1.0: the fingerprint of their logs and settings."""
+"""Finished windows, and the belief behind them. The estimate keeps them and compares what they belong to with its
+settings."""
 
 
 def begin_anew(out: Path, *names: str) -> None:

@@ -125,18 +125,16 @@ def _diagnosed(task: Task, drive: Log, note: str | None) -> tuple[list[Row], str
     from avtorch.gap.simulator.plant import GapPlant
 
     given = task.settings
-    with _checkpoint(task) as kept:
-        found = diagnose(
-            drive,
-            baseline=None if given.baseline == "glvd" else GapPlant.from_toml(given.baseline),
-            effects=given.effects,
-            pairs=given.pairs,
-            posterior=given.posterior,
-            budget_s=given.budget_s,
-            seed=given.seed,
-            progress=False,
-            checkpoint=kept,
-        )
+    found = diagnose(
+        drive,
+        baseline=None if given.baseline == "glvd" else GapPlant.from_toml(given.baseline),
+        effects=given.effects,
+        pairs=given.pairs,
+        posterior=given.posterior,
+        budget_s=given.budget_s,
+        seed=given.seed,
+        progress=False,
+    )
     return diagnosis_rows(found, note), None if task.report is None else task.report(found)
 
 

@@ -10,9 +10,10 @@ Example:
     ('dead_time', 0.4)
 """
 
+from typing import TYPE_CHECKING, Any
+
 from avtorch.gap import effects
 from avtorch.gap.answer.budget import Budget, ChancePart, ChannelError, Part, Unexplained
-from avtorch.gap.budget.gap_budget import gap_budget
 from avtorch.gap.effects import (
     AerodynamicDrag,
     Backlash,
@@ -44,6 +45,9 @@ from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.plant import BASELINE, GapPlant, plant
 from avtorch.gap.simulator.recursion import scan, scan_pair
 from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
+
+if TYPE_CHECKING:
+    from avtorch.gap.diagnose import gap_budget
 
 __all__ = [
     "BASELINE",
@@ -92,3 +96,12 @@ __all__ = [
     "scan",
     "scan_pair",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """The engine is loaded when first used: its compiled code takes a second."""
+    if name == "gap_budget":
+        from avtorch.gap.diagnose import gap_budget
+
+        return gap_budget
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from os import PathLike
 from typing import Literal
 
@@ -12,52 +13,38 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
+from avtorch.gap.answer.aliases import lookalikes, note
 from avtorch.gap.answer.budget import MATERIAL, Budget
 from avtorch.gap.answer.given_dead_time import given_dead_time
 from avtorch.gap.answer.location import RowAttribution, localise
-from avtorch.gap.answer.plausibility import implausible
-from avtorch.gap.answer.verdict import Candidate, Verdict, verdict_of
+from avtorch.gap.answer.scope import Scope
 from avtorch.gap.black_box import BlackBoxSimulator
-from avtorch.gap.budget.account import account, divisible, restated
-from avtorch.gap.budget.forward_selection import MOST_PARTS
-from avtorch.gap.budget.repaired_model import parameter_draws, repaired_plant, with_chance
-from avtorch.gap.budget.shrinkage import shrinkage_of
-from avtorch.gap.crossval.attribution import row_attribution
-from avtorch.gap.crossval.cross_validate import cross_validate
-from avtorch.gap.crossval.gap_closed import gap_closed
-from avtorch.gap.drive_record import Record
-from avtorch.gap.posterior import sample as posteriors
-from avtorch.gap.posterior.draws import Draws
-from avtorch.gap.posterior.summary import belief, lag_and_gain, repaired, reported, reported_draws
+from avtorch.gap.engine.average import Weight
+from avtorch.gap.engine.coordinates import EFFECTS, adopt, base_name
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.inference import RANDOM, Inference, infer
+from avtorch.gap.engine.sample import sample
 from avtorch.gap.result import sentences
+from avtorch.gap.result.attribution import row_attribution
+from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.result.diagnosis import Diagnosis, LogFacts
-from avtorch.gap.result.gap_size import gap_size
-from avtorch.gap.result.predictive_model import predictive_models
-from avtorch.gap.result.rival_models import noise_left, rival_models
+from avtorch.gap.result.free_runs import Blocks
+from avtorch.gap.result.gap_budget import budget_of, shrinkage_of
+from avtorch.gap.result.gap_size import Simulated, gap_size
+from avtorch.gap.result.held_out import held_out_errors, nested
+from avtorch.gap.result.hypotheses import best_weight, candidates_of, first_onset, verdict, verdict_names
+from avtorch.gap.result.parameters import ParameterPosterior, base_quantities
+from avtorch.gap.result.predictive_model import noise_of, predictive_models
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import uncounted
-from avtorch.gap.rollout_errors import rolled_out
-from avtorch.gap.search.fitted_model import FittedModel, SearchResult
-from avtorch.gap.search.search import Search
-from avtorch.gap.selection import periodic_commands as delays
-from avtorch.gap.selection.adequacy import Adequacy, adequacy
-from avtorch.gap.selection.aliases import Identifiability
-from avtorch.gap.selection.model_probabilities import favourite, model_probabilities
 from avtorch.gap.sensor_noise import with_sensor_noise
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.effect_choice import chosen_effects
+from avtorch.gap.simulator.observability import is_observable
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.whole_progress import WholeProgress
 from avtorch.io import Log, LogSource, as_logs
 from avtorch.io.mapping import Pairs
-
-# Probability of an unknown cause after the best single effect, from which held-out blocks decide without any pair: in
-# 36 simulated logs pairs brought it below a half from 0.98 at most; behind most ordinary recorders it is above 0.99.
-_LOST = 0.99
-_NO_PAIRS = (
-    "The likelihood tried no pairs: its noise does not hold for this log with the best single effect, so held-out "
-    "blocks select the effects, any number of them."
-)
 
 
 @shows_progress
@@ -76,29 +63,27 @@ def diagnose(
     material: float = MATERIAL,
     seed: int = 0,
     progress: Callable[[str, int, int], None] | bool | None = None,
-    checkpoint: str | PathLike[str] | None = None,
 ) -> Diagnosis:
     """Name what `baseline` lacks on these drives of one car, and how much of the gap each effect contributes.
 
-    The likelihood's verdict holds where it names something. Where it is `unknown`, effects are selected on held-out
-    blocks under noise of any spectrum: any number of them.
+    One model of the car, its recorder and its noise gives the evidence of every set of effects that a search visits;
+    the answer is their average (`avtorch.gap.engine`). Held-out blocks measure what the named causes take off.
 
     Args: `logs`: one log or several, each a `Log`, a path or a data frame; `map`, `unit`: names and units of the
     columns of those that are read here, as `Log.read` takes them.
 
     `baseline`: the user's simulator (default: bare GLVD); its effects keep their values, `T_L` and `K_L` are
-    fitted. One that is not made of effects comes as an `avtorch.ExternalSimulator`. `prior`: weights over causes, see
-    `model_probabilities`. `effects`: those to test, by name or class (default: all registered). `pairs`: also test
-    several at once. `posterior` of the verdict's parameters: by SGLD, or Laplace's approximation. `material`: share of
-    the gap from which something counts. `budget_s`: after this time no new hypothesis is fitted; where that cuts the
-    search short, `complete` is False and the verdict provisional: `scope` lists what was tested, and the verdict is
-    distinguished only from that. `accel_kind`: whether `accel` is dv/dt or an accelerometer's reading (default: as the
-    logs state). `progress(what, done, of)` is called at each step, with `done` of `of` in the whole diagnosis;
-    True is a bar, False none, and None a bar in a notebook only. `checkpoint`: a file that stores what is finished; a
-    later search of the same logs with the same settings continues from it, to the same answer.
+    fitted. One that is not made of effects comes as an `avtorch.ExternalSimulator`. `prior`: weights over causes by
+    name; those of `"pair"` for several at once. `effects`: those to test, by name or class (default: all registered).
+    `pairs`: also test several at once. `posterior` of the verdict's parameters: by SGLD, or Laplace's approximation.
+    `material`: share of the gap from which something counts. `budget_s`: after this time no new hypothesis is fitted;
+    where that cuts the search short, `complete` is False and the verdict provisional: `scope` lists what was tested,
+    and the verdict is distinguished only from that. `accel_kind`: whether `accel` is dv/dt or an accelerometer's
+    reading (default: as the logs state). `progress(what, done, of)` is called at each step; True is a bar, False none,
+    and None a bar in a notebook only.
 
-    Raises `InputError` for a log without `accel_cmd`, without 10 s of usable driving, for wrong arguments, or for a
-    `checkpoint` that is damaged or belongs to other logs or settings.
+    Raises `InputError` for a log without `accel_cmd`, without a stretch of 12 s of usable driving, or for wrong
+    arguments.
 
     Example:
         >>> from avtorch import Leader, diagnose, simulate
@@ -109,8 +94,8 @@ def diagnose(
         >>> found.verdict.name, round(found.probability("dead_time"), 2)
         ('sensor_bias', 0.0)
     """
-    told = called(progress)
-    stages = None if told is None else WholeProgress(told)
+    given = called(progress)
+    told = None if given is None else WholeProgress(given)
     each = as_logs(logs, map=map, unit=unit)
     if accel_kind is not None:
         if accel_kind not in ("kinematic", "specific-force"):
@@ -121,7 +106,7 @@ def diagnose(
     if not 0 < material < 1:
         raise InputError(f"material: found {material}, needs a share between 0 and 1")
     if isinstance(baseline, BlackBoxSimulator):
-        beside = baseline.beside(each, stages)
+        beside = baseline.beside(each, given)
         found = diagnose(
             beside.logs,
             baseline=beside.plant,
@@ -132,239 +117,193 @@ def diagnose(
             budget_s=budget_s,
             material=material,
             seed=seed,
-            progress=told or False,
-            checkpoint=checkpoint,
+            progress=given or False,
         )
         return beside.told(found)
-    measured, read = each, [with_sensor_noise(log) for log in each]
-    each, noise_added = [log for log, _ in read], dict.fromkeys(note for _, note in read if note)
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = chosen_effects(effects)
-    search = Search(
-        each,
-        base,
-        effects=kinds,
-        pairs=pairs,
-        lost=(lambda singles, record: _unknown(singles, record, prior) > _LOST) if divisible(measured) else None,
-        budget_s=budget_s,
-        progress=stages,
-        checkpoint=checkpoint,
+    read = [with_sensor_noise(log) for log in each]
+    each, notes = [log for log, _ in read], dict.fromkeys(note for _, note in read if note)
+    data = DriveData.of(each)
+    shown = [kind for kind in kinds if is_observable(kind, data.channels)]
+    inference = infer(
+        data,
+        baseline=base,
+        effects=tried_names(shown),
+        most=None if pairs else 1,
+        prior=checked_prior(prior, kinds),
+        stop=deadline(budget_s),
+        progress=told,
     )
-    race = search.run()
-    top = favourite(race.found)
-    apart = Identifiability.of(race, kinds, prior)
-    chances = apart.shared(model_probabilities(race.found, left_over(top, race.record), prior))
-    undetermined = delays.undetermined_delays(race.found)
-    chances = delays.shared(chances, undetermined)
-    candidates = [_candidate(f, race, chances[f.name], kinds) for f in race.found]
-    # for an unknown cause the only model is the bare baseline
-    bare = implausible({}, lag_and_gain(race.none))
-    candidates.append(Candidate("unknown", chances["unknown"], None, {}, {}, None, bare))
-    candidates += apart.mirrored(candidates, chances)
-    known = "known effect" if race.complete and race.scope.whole else "effect tried"
-    verdict = verdict_of(
-        candidates,
-        aliases=lambda c: delays.add_delay_aliases(apart.alias_set(c), undetermined),
-        why=delays.why(chances, undetermined),
-        known=known,
-    )
-    won = next((f for f in race.found if f.name == verdict.name), None)
-    accounted = account(
-        measured,
-        base,
-        kinds,
-        candidates,
-        verdict,
-        won,
-        material=material,
-        most=(MOST_PARTS if pairs else 1) if race.complete else 0,
-        seed=seed,
-        progress=stages,
-        checkpoint=search.fits.checkpoint,
-    )
-    if accounted is not None:
-        candidates, verdict = list(accounted.candidates), accounted.verdict
-        if not race.complete and "unknown" not in verdict.alias_set:  # which stands for what was not tried
-            verdict = replace(verdict, alias_set=(*verdict.alias_set, "unknown"))
-    budget = None if accounted is None else accounted.budget
-    selected = accounted.selection if accounted is not None and accounted.held_out else None
-    winner = None if selected is not None else next((f for f in race.found if f.name == verdict.name), None)
-    draws = None
-    one_mode = winner is not None and (winner.delays is None or len(winner.delays.lengths) == 1)
-    if winner is not None and winner.hypothesis.size and winner.name != "none" and posterior == "sgld" and one_mode:
-        draws = _draws(winner, seed)
-        anew = _candidate(winner, race, chances[winner.name], kinds, draws)
-        candidates = [anew if c.name == winner.name else c for c in candidates]
-        budget = None if budget is None else restated(budget, anew)
-    noted = tuple(noise_added)
-    if not race.complete:
-        noted += ("The budget ended the search before all hypotheses were tried: the verdict is provisional.",)
-    noted += tuple(sentences.untried(race.scope))
-    if race.scope.pairs == "lost":
-        noted += (_NO_PAIRS,)
-    noted += tuple(delays.notes(race.found, verdict))
-    if posterior == "sgld" and not one_mode and winner is not None:
-        noted += (
-            "The parameters' posterior is by laplace: it has several modes, and no chain would cross between them.",
-        )
-    if draws is not None and draws.method != "sgld":
-        noted += (f"The parameters' posterior is by {draws.method}: {draws.why}.",)
-    if apart.note is not None:
-        noted += (apart.note,)
-    named = winner is not None and winner.name != "none"
-    # an unknown cause gets the onset of the most probable named effect
-    onset = None if verdict.name == "none" or selected is not None else _onset(winner or top, race)
-    if selected is not None and budget is not None:
-        onset = _of_the_only_part(budget, verdict, each)
-    alike = {part for name in verdict.alias_set for part in name.split("+")}
-    # where nothing is named, no effect closes anything
-    held = cross_validate(race, winner, alike=sorted(alike), progress=stages) if named and winner else None
-    attribution = row_attribution(race, winner or top)
-    car, beliefs = None, belief(race.none)
-    shrinkage = None if held is None else gap_closed(held)
-    contenders, errors = predictive_models(race, verdict), (race.none if winner is None else winner).errors
-    if named and winner is not None:
-        car, beliefs = repaired(winner, base, draws), belief(winner, draws)
-    elif selected is not None and budget is not None and budget.names:
-        car, beliefs = repaired_plant(selected, base), parameter_draws(selected, seed=seed)
-        errors = _errors(each, race.record, car, budget)
-        noise = noise_left(race.record, errors, race.none.noise.noise, car, budget)
-        car = with_chance(car, budget, kinds, noise)
-        if budget.parts:  # no rollout shows what chance decides
-            shrinkage = shrinkage_of(selected)
-            contenders = rival_models(
-                selected,
-                budget,
-                verdict,
-                base,
-                kinds,
-                noise=noise,
-                probability=next(c.probability for c in candidates if c.name == verdict.name),
-                specific_force=race.record.accel_kind == "specific-force",
-                seed=seed,
-            )
+    average, none = inference.average, inference.base
+    rows = CountedRows.of(inference.data, tuple(each))
+    names = verdict_names(average)
+    weight = best_weight(average, names)
+    named = names[0] not in ("none", "unknown")
+    chosen = _posterior(weight, posterior, seed) if named else ParameterPosterior(weight, seed=seed)
+    candidates, posteriors = candidates_of(inference, each, kinds, chosen if named else None)
+    # an unknown cause shows where the best known ones would act
+    top = weight if named or names == ("none",) else _likeliest(inference)
+    best = top.examined.hypothesis
+    if told is not None:
+        told("held-out blocks", 0, 1)
+    held = None
+    if Blocks.of(inference.data) is not None:
+        held = held_out_errors(nested(none, weight.examined.hypothesis, inference.search.visited.values()))
+    budget = None
+    if held is not None:
+        budget = budget_of(average, chosen, held, each, names=names, material=material, seed=seed)
+    if budget is not None:
+        names = budget.verdict
+    complete = inference.search.complete
+    known = "known effect" if complete and len(kinds) >= len(chosen_effects(None)) else "effect tried"
+    said = verdict(average, names, known, partial=budget is not None and budget.partial)
+    if not complete and "unknown" not in said.alias_set:  # which stands for what was not tried
+        said = replace(said, alias_set=(*said.alias_set, "unknown"))
+    if told is not None:
+        told("held-out blocks", 1, 1)
+    hidden = note(data.channels, kinds)
+    alike = lookalikes(said.name, data.channels, specific_force=data.accel_kind == "specific-force", among=kinds)
+    said = replace(said, alias_set=tuple(dict.fromkeys([*said.alias_set, *sorted(alike)])))
+    attribution = row_attribution(rows, best, none)
+    onset = first_onset(weight if named else top, names if named else top.label.split("+"), each)
+    scope = _scope(inference, shown, data.channels, pairs)
+    lag_and_gain, assumed = base_quantities(none, seed)
+    noise = noise_of(weight)
+    bare = _base_weight(inference)
+    simulator = ParameterPosterior(bare).plant(base, noise_of(bare).jerk_sd)
+    errors = [rows.errors(h) for h in (none, best)]
     return Diagnosis(
         log=LogFacts.of(each),
-        baseline=lag_and_gain(race.none),
-        gap=gap_size(race, top, detected=chances["none"] < 0.5, p_value=attribution.p_value),
+        baseline=lag_and_gain,
+        gap=gap_size(
+            rows,
+            Simulated(errors[0], none["T_L"]),
+            Simulated(errors[1], best["T_L"]),
+            detected=average.probabilities["none"] < 0.5,
+            p_value=attribution.p_value,
+        ),
         candidates=tuple(candidates),
-        verdict=verdict,
-        onset_s=None if onset is None else onset.stamp_s,
-        onset_from_start_s=None if onset is None else onset.from_start_s,
+        verdict=said,
+        onset_s=None if onset is None or names == ("none",) else onset.stamp_s,
+        onset_from_start_s=None if onset is None or names == ("none",) else onset.from_start_s,
         onset_log=0 if onset is None else onset.log,
-        plant=car,
-        simulator=repaired(race.none, base),
-        belief=beliefs,
-        assumed=belief(race.none),
-        draws=reported_draws(winner, draws) if draws is not None and winner is not None else None,
+        plant=chosen.plant(base, noise.jerk_sd) if named else None,
+        simulator=simulator,
+        belief=chosen.belief() if named else assumed,
+        assumed=assumed,
+        draws=chosen.chains if named else None,
         where=()
-        if verdict.name == "none"
-        else localise(attribution, onset_s=None if onset is None else onset.from_start_s, lag=race.none.values["T_L"]),
-        shrinkage=shrinkage,
-        contenders=contenders,
-        traces=_traces(each, race, errors, attribution),
-        remaining=given_dead_time(candidates, verdict, base),
-        complete=race.complete,
-        scope=race.scope,
-        notes=noted,
+        if names == ("none",)
+        else localise(attribution, onset_s=None if onset is None else onset.from_start_s, lag=none["T_L"]),
+        shrinkage=shrinkage_of(held, seed) if held is not None and named else None,
+        contenders=predictive_models(posteriors, said, base),
+        traces=_traces(each, rows, errors[0], errors[1] if named else errors[0], attribution),
+        remaining=given_dead_time(candidates, said, base),
+        complete=complete,
+        scope=scope,
+        notes=(*notes, *([hidden] if hidden else []), *sentences.untried(scope)),
         budget=budget,
     )
 
 
-def left_over(top: FittedModel, record: Record) -> Adequacy:
-    """Structure left in the residuals of the most probable hypothesis, less what lost messages explain row by row."""
-    explained = (top.losses.evidence if top.losses else 0.0) + (top.by_chance.explained if top.by_chance else 0.0)
-    return adequacy(top.white, top.errors, record.measured - top.errors, explained=explained)
+@shows_progress
+def gap_budget(
+    logs: Log | Sequence[Log],
+    *,
+    baseline: GapPlant | str | PathLike[str] | None = None,
+    effects: Sequence[str | type[Effect]] | None = None,
+    material: float = MATERIAL,
+    seed: int = 0,
+    progress: Callable[[str, int, int], None] | bool | None = None,
+) -> Budget:
+    """The budget of the gap between `baseline` (default: bare GLVD) and the car of these drives: that of `diagnose`.
+
+    Args: as of `diagnose`. Raises `InputError` as it does, and for drives too short to hold out five blocks.
+
+    Example:
+        >>> from avtorch import Leader, simulate
+        >>> from avtorch.gap import ConstantResistance, gap_budget, plant
+        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
+        >>> log = simulate(Leader.default(start=30.0, duration=60.0, dt=0.05), plant=dragging).log()
+        >>> gap_budget(log, effects=["constant_resistance", "dead_time"]).names
+        ('constant_resistance',)
+    """
+    settings = {"baseline": baseline, "effects": effects, "material": material, "seed": seed}
+    found = diagnose(logs, **settings, progress=progress)
+    if found.budget is None:
+        raise InputError(f"{found.log.name}: {found.log.seconds:.0f} s are too short to hold out five blocks of 4 s")
+    return found.budget
 
 
-def _unknown(found: Sequence[FittedModel], record: Record, prior: Mapping[str, float] | None) -> float:
-    """Probability that none of these hypotheses is the cause."""
-    return model_probabilities(found, left_over(favourite(found), record), prior)["unknown"]
+def tried_names(kinds: Sequence[type[Effect]]) -> tuple[str, ...]:
+    """Names by which the engine knows these effects, its variants of them among them."""
+    own = {adopt(kind).name if not kind.random and kind.name not in RANDOM else kind.name for kind in kinds}
+    variants = [e for e in EFFECTS if base_name(e) in own or (e.startswith("~"))]
+    return tuple(dict.fromkeys([*own, *variants]))
 
 
-def _errors(logs: Sequence[Log], record: Record, car: GapPlant, budget: Budget) -> FloatArray:
-    """Errors (channel, counted, group) of the simulator with the parts of a budget, each from its onset on."""
-    late = {p.name: p.onset_s - logs[0].epoch_s for p in budget.parts if p.onset_s is not None}
-    return record.measured - rolled_out(record, car, late)
+def checked_prior(prior: Mapping[str, float] | None, kinds: Sequence[type[Effect]]) -> Mapping[str, float] | None:
+    """The user's weights. Raises `InputError` for other names, or weights that are negative or not finite."""
+    allowed = {*(kind.name for kind in kinds), "none", "unknown", "pair"}
+    for name, value in (prior or {}).items():
+        if name not in allowed:
+            raise InputError(f"prior: found {name!r}, needs one of {', '.join(sorted(allowed))}")
+        if not (np.isfinite(value) and value >= 0):
+            raise InputError(f"prior: found {value!r} for {name}, needs a weight of 0 or more")
+    return prior
 
 
-def _traces(logs: Sequence[Log], race: SearchResult, errors: FloatArray, attribution: RowAttribution) -> Traces:
-    """`errors` (channel, counted, group): of the simulator with what was named."""
-    record = race.record
-    measured = record.measured.mean(-1)
-    return Traces(
-        time=record.time[record.source],
-        command=record.command[record.source],
-        channels=record.channels,
-        measured=measured,
-        before=measured - race.none.errors.mean(-1),
-        after=measured - errors.mean(-1),
-        does=attribution.does,
-        stretch=record.stretch,
-        uncounted=uncounted(logs, record),
-    )
-
-
-def _draws(found: FittedModel, seed: int) -> Draws:
-    return posteriors.posterior(found, seed=seed)
-
-
-def _candidate(
-    found: FittedModel,
-    race: SearchResult,
-    probability: float,
-    kinds: Sequence[type[Effect]],
-    draws: Draws | None = None,
-) -> Candidate:
-    """A hypothesis as listed in the answer; its parameters only where they are relevant."""
-    gain = float(found.log_evidence - race.none.log_evidence)
-    if found.name == "none":
-        return Candidate("none", probability, gain, {}, {}, None, implausible({}, lag_and_gain(found)))
-    if probability < 1e-4:
-        return Candidate(found.name, probability, gain, {}, {}, None)
-    parameters, base = reported(found, draws), lag_and_gain(found, draws)
-    own = [kind for kind in kinds if kind.name in found.name.split("+")]
-    odd = implausible(parameters, base, own)
-    onset = _onset(found, race)
-    began = None if onset is None else onset.stamp_s
-    return Candidate(found.name, probability, gain, parameters, base, began, odd)
-
-
-@dataclass(frozen=True)
-class _Onset:
-    """A time in log number `log`: `stamp_s` on the log's own clock, `from_start_s` from its first row [s]."""
-
-    stamp_s: float
-    from_start_s: float
-    log: int
-
-    @classmethod
-    def at(cls, record: Record, row: int, time: float | None = None) -> _Onset:
-        """The time of a counted `row`, or a given `time` [s from the start] near that row."""
-        place = record.source[row]
-        start = float(record.time[place]) if time is None else time
-        stamp = float(record.stamp[place]) if time is None else start + float(record.stamp[place] - record.time[place])
-        return cls(stamp, start, int(record.log[place]))
-
-
-def _of_the_only_part(budget: Budget, verdict: Verdict, logs: Sequence[Log]) -> _Onset | None:
-    """The onset of the part that held-out blocks selected, where it is the whole verdict; of several each has one."""
-    found = next((part.onset_s for part in budget.parts if (part.name,) == tuple(verdict.names)), None)
-    return None if found is None else _Onset(found, found - logs[0].epoch_s, 0)
-
-
-def _onset(found: FittedModel | None, race: SearchResult) -> _Onset | None:
-    """The onset of a fitted model: the effect's own onset parameter where it has one."""
-    if found is None:
+def deadline(budget_s: float | None) -> Callable[[], bool] | None:
+    """A function that tells whether the time is over."""
+    if budget_s is None:
         return None
-    own = found.hypothesis.effects[0] if len(found.hypothesis.effects) == 1 else None
-    if own is not None and own.own_onset is not None and found.name == own.name:
-        change = float(found.values[f"{own.name}.{own.own_onset}"])
-        row = int(np.abs(race.record.time[race.record.source] - change).argmin())
-        return _Onset.at(race.record, row, change)
-    alone = bool(found.searched) and found.name == found.searched[-1].name
-    if alone and found.tails is not None and found.tails.onset is not None:
-        return _Onset.at(race.raw, found.tails.onset)
-    if alone and found.losses is not None and found.losses.onset is not None:
-        return _Onset.at(race.raw, found.losses.onset)
-    return None if found.began is None else _Onset.at(race.record, found.began)
+    end = time.monotonic() + budget_s
+    return lambda: time.monotonic() > end
+
+
+def _posterior(weight: Weight, method: str, seed: int) -> ParameterPosterior:
+    if method == "laplace":
+        return ParameterPosterior(weight, seed=seed)
+    return ParameterPosterior(weight, sample(weight.examined.hypothesis, seed=seed), seed=seed)
+
+
+def _likeliest(inference: Inference) -> Weight:
+    """The strongest weight of a label with names."""
+    named = [w for label, w in inference.average.best.items() if label not in ("none", "unknown")]
+    return max(named or inference.average.best.values(), key=lambda w: w.log_weight)
+
+
+def _base_weight(inference: Inference) -> Weight:
+    """A weight of the base alone."""
+    found = [w for w in inference.average.best.values() if not w.examined.hypothesis.effects]
+    weight = inference.average.best.get("none") or (found[0] if found else next(iter(inference.average.best.values())))
+    alone = next(x for x in inference.average.examined if not x.hypothesis.effects)
+    return replace(weight, label="none", examined=alone, composition=alone.compositions[0], slow="none", outliers=False)
+
+
+def _scope(inference: Inference, kinds: Sequence[type[Effect]], channels: Sequence[str], pairs: bool) -> Scope:
+    """What was tried: everything that promised something was, unless the time was over."""
+    complete = inference.search.complete
+    visited = {base_name(e) for key in inference.search.visited for e, _ in key}
+    tried = {kind.name for kind in kinds} if complete else visited
+    how = "none" if not pairs else "all" if complete else "some"
+    return Scope.of(kinds, tried | {kind.name for kind in kinds if kind.random}, channels, how)
+
+
+def _traces(
+    logs: Sequence[Log], rows: CountedRows, before: FloatArray, after: FloatArray, attribution: RowAttribution
+) -> Traces:
+    """`before`, `after` (channel, row, group): errors without and with what was named."""
+    measured = rows.measured.mean(-1)
+    return Traces(
+        time=rows.time,
+        command=rows.command,
+        channels=rows.channels,
+        measured=measured,
+        before=measured - before.mean(-1),
+        after=measured - after.mean(-1),
+        does=attribution.does,
+        stretch=rows.stretch,
+        uncounted=uncounted(logs, rows),
+    )

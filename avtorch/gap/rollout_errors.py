@@ -21,6 +21,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.counted import Counted
 from avtorch.gap.drive_record import Record
 from avtorch.gap.simulator.plant import GapPlant
 
@@ -90,7 +91,7 @@ def _window(x: FloatArray, length: int, keeps: float) -> FloatArray:
 
 
 def products(
-    metric: ErrorMetric, record: Record, errors: FloatArray, blocks: Sequence[slice], lag: float
+    metric: ErrorMetric, record: Counted, errors: FloatArray, blocks: Sequence[slice], lag: float
 ) -> FloatArray:
     """(block, one, other): sums of products of `errors` (one, channel, counted, group) of long rollouts, by a measure.
 
@@ -109,7 +110,7 @@ def products(
 
 
 def block_squares(
-    record: Record, errors: FloatArray, blocks: Sequence[slice], lag: float, horizon: float
+    record: Counted, errors: FloatArray, blocks: Sequence[slice], lag: float, horizon: float
 ) -> dict[str, FloatArray]:
     """Squared rollout errors of each block (block,), by metric, of a long rollout's `errors` (channel, counted, group).
 
@@ -122,7 +123,7 @@ def block_squares(
     return out
 
 
-def rms(metric: RolloutMetric, record: Record, errors: FloatArray, lag: float) -> float:
+def rms(metric: RolloutMetric, record: Counted, errors: FloatArray, lag: float) -> float:
     """Root mean square of a long rollout's `errors` (channel, counted, group) by a measure, over all counted rows;
     `lag` [s]."""
     edges = [*record.starts.tolist(), record.rows]
@@ -130,7 +131,7 @@ def rms(metric: RolloutMetric, record: Record, errors: FloatArray, lag: float) -
     return float(np.sqrt(total / (record.rows * record.group)))
 
 
-def reached(metric: ErrorMetric, record: Record) -> float | None:
+def reached(metric: ErrorMetric, record: Counted) -> float | None:
     """Longest rollouts [s] of a measure that the stretches hold; None: as long as the stretches."""
     if metric.horizon_s is None or not np.isfinite(metric.horizon_s):
         return None

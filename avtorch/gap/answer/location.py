@@ -16,7 +16,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.drive_record import Record
+from avtorch.gap.counted import Counted
 
 _MOST = 0.95  # share of the cause's effect that a part holds
 _BAND = 0.9  # share of the power
@@ -72,7 +72,7 @@ class RowAttribution:
     itself.
     """
 
-    record: Record
+    record: Counted
     gained: FloatArray = field(repr=False)
     paid: float
     does: FloatArray = field(repr=False)

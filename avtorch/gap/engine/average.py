@@ -176,7 +176,7 @@ def average(
     prior: Mapping[str, float] | None = None,
 ) -> ModelAverage:
     """The model average over examined hypotheses. `effects`: names that a label may hold; `most` of them; `prior`:
-    weights of causes by name, 1 where not given."""
+    weights of causes by name, 1 where not given; of `"pair"` for several at once."""
     weights = [w for x in examined for w in _weights(x, examined, alone)]
     if effects is not None or most is not None:
         allowed = None if effects is None else {*effects, "none", "unknown"}
@@ -189,7 +189,7 @@ def average(
     total: dict[str, list[float]] = {"none": [], "unknown": []}
     best: dict[str, Weight] = {}
     for w in weights:
-        given = sum(math.log(max((prior or {}).get(name, 1.0), 1e-300)) for name in w.label.split("+"))
+        given = _given(w.label, prior or {})
         total.setdefault(w.label, []).append(TEMPER * w.log_weight + given)
         if w.label not in best or best[w.label].log_weight < w.log_weight:
             best[w.label] = w
@@ -205,6 +205,13 @@ def average(
 
 
 # inside ---------------------------------------------------------------------------------------------------------------
+def _given(label: str, prior: Mapping[str, float]) -> float:
+    """Logarithm of the user's weight of a label: the product of its causes', times that of `"pair"` for several."""
+    names = label.split("+")
+    weights = [prior.get(name, 1.0) for name in names] + ([prior.get("pair", 1.0)] if len(names) > 1 else [])
+    return sum(math.log(max(x, 1e-300)) for x in weights)
+
+
 def _ranking(h: Hypothesis) -> float:
     return h.score
 
@@ -296,6 +303,7 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
                 value -= SLOW_FORCE_NATS + (_FAINT_GUST / sd) ** 2
             if unnamed and not (alone and slow == "gust"):
                 label = None
+                value -= UNKNOWN_NATS
             causes = None
             if label is not None:
                 faint = slow == "gust" and c.slow.gust_sd < _FAINT_GUST

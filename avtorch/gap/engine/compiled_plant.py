@@ -22,8 +22,9 @@ from numba import njit
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.gap.engine.coordinates import INDEX, NEUTRAL
 
-GRID_S = 0.0126
-"""Longest step of the grid [s]: a recorder's delay, of 10 ms and more, is read between its points."""
+GRID_S = 0.0252
+"""Longest step of the grid [s]: between its points, where a recorder's delay is read, a lagged acceleration of
+10 m/s⁴ is straight to 1 mm/s²."""
 
 _T_L, _K_L = INDEX["T_L"], INDEX["K_L"]
 _DRIVE, _BRAKE = INDEX["drive_limit"], INDEX["brake_limit"]

@@ -152,8 +152,8 @@ def _nuisance(name: str, parameter: str, mean: float, sd: float, low: float, hig
     return Coordinate(name, parameter, "value", low, high, sd, mean=mean)
 
 
-_SPEED, _BOTH = frozenset({"speed"}), frozenset({"accel", "speed"})
-_RING = tuple((a, b, f, 0.08) for f in (1.0, 1.25, 1.6, 2.0, 2.5, 3.0, 3.6, 4.4) for a, b in ((0.05, 0.1),))
+_SPEED, _ACCEL, _BOTH = frozenset({"speed"}), frozenset({"accel"}), frozenset({"accel", "speed"})
+_RING = tuple((0.3, 0.0, f) for f in (1.0, 1.25, 1.6, 2.0, 2.5, 3.0, 3.6, 4.4))
 
 _square = Coordinate(
     "square_period", "inverse_frequency_s", "square", 0.0, 4.0, SCALE_OF_RANGE / 9, FAINT_OF_RANGE / 12**2
@@ -237,10 +237,10 @@ EFFECTS: dict[str, EngineEffect] = {
         EngineEffect(
             "driveline_oscillation",
             (
-                Coordinate("ring_amplitude", "amplitude", "value", -2, 2, 0.3, FAINT_OF_RANGE * 0.5 / 3),
-                Coordinate("ring_quadrature", "quadrature", "value", -2, 2, 0.3, FAINT_OF_RANGE * 0.5 / 3),
+                # a ring follows a step in its direction; the other sign would be one more lag
+                Coordinate("ring_quadrature", "quadrature", "value", 0, 4, 0.3, FAINT_OF_RANGE * 0.5 / 3),
+                _nuisance("ring_amplitude", "amplitude", 0.0, 0.3, -1.0, 1.0),
                 _nuisance("ring_frequency", "frequency_hz", 2.5, 1.2, 0.8, 5.5),
-                _nuisance("ring_damping", "mode_damping", 0.08, 0.06, 0.01, 0.35),
             ),
             _RING,
         ),
@@ -281,14 +281,14 @@ EFFECTS: dict[str, EngineEffect] = {
             (_sized("sensor_lag", "sensor_lag", "lag_s", "value", 0, 6),),
             ((0.1,), (0.3,)),
             "may",
-            _BOTH,
+            _ACCEL,
         ),
         EngineEffect(
             "sensor_bias",
             (_sized("sensor_bias", "sensor_bias", "bias_mps2", "value", -4, 4),),
             ((0.1,),),
             "may",
-            _BOTH,
+            _ACCEL,
         ),
         EngineEffect(
             "sensor_scale",

@@ -10,8 +10,8 @@ Coordinates have limits. Samplers walk in z, which has none; the Jacobian is par
 
     x = low + s (softplus(z / s) - softplus((z - range) / s))
 
-is z itself but within some `knee` s of a limit, so that what is normal stays normal. A recorder's delay has no limits of
-its own here; its z is the channel's lateness, delay plus filter, which a log knows far better than either.
+is z itself but within some `knee` s of a limit, so that what is normal stays normal. A recorder's delay has no limits
+here; its z is the channel's lateness, delay plus filter, which a log knows far better than either.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from avtorch.gap.engine.gauss_newton import normal_prior
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import _LEAST
 from avtorch.gap.engine.priors import TEMPER
-from avtorch.gap.engine.torch_plant import TorchPlant
+from avtorch.gap.engine.torch_plant import SimulatorPlant, TorchPlant, torch_plant
 from avtorch.gap.engine.torch_recorder import TorchRecorder
 
 _BLOCK = 2**18  # columns times steps of the grid at once: few enough for the processor's cache
@@ -159,13 +159,15 @@ class HypothesisDensity:
     def value(self, z: Tensor) -> Tensor:
         """`log_prob` by the compiled plant."""
         flat = z.detach().reshape(-1, z.shape[-1])
-        value = torch.as_tensor(self.compiled(self.constrain(flat.nan_to_num(0.0)).numpy())) + self.log_slope(flat).sum(-1)
+        value = torch.as_tensor(self.compiled(self.constrain(flat.nan_to_num(0.0)).numpy())) + self.log_slope(flat).sum(
+            -1
+        )
         return value.reshape(z.shape[:-1])
 
     # inside -----------------------------------------------------------------------------------------------------------
     @cached_property
-    def _plant(self) -> TorchPlant:
-        return TorchPlant.of(self.hypothesis)
+    def _plant(self) -> TorchPlant | SimulatorPlant:
+        return torch_plant(self.hypothesis)
 
     @cached_property
     def _recorder(self) -> TorchRecorder:

@@ -30,6 +30,7 @@ from avtorch.io.no_command import no_command
 _MOST_HZ = 100.0  # rows of faster logs are averaged: nothing above half of it is a car's
 _SMOOTH_S = 0.3  # the speed enters effects smoothed over it
 _START_S = 0.6  # over which the first acceleration is averaged
+_LEAST_COEFFICIENTS = 6  # of a band, in each channel
 _FRAMES = 30  # of a drive, within the limits of their length
 
 
@@ -320,7 +321,7 @@ class DriveData:
         other = copy.copy(self)
         other.cache = {k: v for k, v in self.cache.items() if k == "grid"}
         other.band_edges = edges
-        other.frequency = np.ascontiguousarray(self.frequency[: int(edges[-1])])
+        other.frequency = np.asarray(self.frequency[: int(edges[-1])], np.float64)
         other.measured = np.ascontiguousarray(self.measured[:, :, : edges[-1]])
         return other
 
@@ -342,9 +343,10 @@ class DriveData:
         self.frame_time = np.concatenate([self.time[i + M * (1 + np.arange(count))] for i, count in self.frames])
         self.used = np.ones(len(self.frame_time), bool)
         self.frequency = (np.arange(M) + 0.5) / (2 * M * self.dt)
-        edges = [0, 1, 2, 3]
+        least = -(-_LEAST_COEFFICIENTS // len(self.frame_time))  # bins: a covariance of few coefficients is singular
+        edges = [0, least, 2 * least, 3 * least]
         while edges[-1] < M:
-            edges.append(max(edges[-1] + 1, int(edges[-1] * BAND_RATIO)))
+            edges.append(max(edges[-1] + least, int(edges[-1] * BAND_RATIO)))
         edges[-1] = M
         if edges[-1] - edges[-2] < 0.4 * (edges[-2] - edges[-3]):
             del edges[-2]

@@ -321,6 +321,15 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float, iterations: int =
         shape = data.channel_count, frames, data.bin_count
         return np.moveaxis(whiten(data, noise, x).reshape(shape), 1, 0).reshape(frames, -1)
 
+    def gain(moves: FloatArray, left: FloatArray) -> tuple[float, FloatArray]:
+        total, after = log_likelihood(data, left)
+        over = min(claimed(data, after) - claimed(data, h.covariance), total - h.log_likelihood)
+        return over + float(pull @ moves - 0.5 * precision @ moves**2), after
+
+    # at a crease of the likelihood the parameters alone promise something: that is no course's
+    white = np.array([whiten(data, h.covariance, j) for j in h.jacobian])
+    alone = np.linalg.solve(white @ white.T + np.diag(precision), white @ whiten(data, h.covariance, h.residual) + pull)
+    promised = max(gain(alone, h.residual - np.einsum("p,pcfk->cfk", alone, h.jacobian))[0], 0.0)
     noise, left = h.covariance, h.residual
     best = FreeFormFit(-math.inf, None, np.zeros(frames))
     for _ in range(iterations):
@@ -337,11 +346,10 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float, iterations: int =
         course, occam = _best_course(score, 0.5 * (information + information.T), priors)
         moves = taken[:, -1] - taken[:, :-1] @ course
         left = h.residual - response * course[:, None] - np.einsum("p,pcfk->cfk", moves, h.jacobian)
-        total, after = log_likelihood(data, left)
-        gain = min(claimed(data, after) - claimed(data, h.covariance), total - h.log_likelihood)
-        gain += float(pull @ moves - 0.5 * precision @ moves**2) + occam - math.log(len(priors))
-        if gain > best.nats:
-            best = FreeFormFit(gain, left, course)
+        over, after = gain(moves, left)
+        over += occam - math.log(len(priors)) - promised
+        if over > best.nats:
+            best = FreeFormFit(over, left, course)
         change = np.log(np.trace(after, axis1=1, axis2=2) / np.trace(noise, axis1=1, axis2=2))
         if np.abs(change).max() < 0.05:  # of a band's variance: no nat in twenty coefficients
             break

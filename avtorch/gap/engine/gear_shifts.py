@@ -23,7 +23,7 @@ from numba import njit
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.gap.engine.compiled_plant import GRID_S
-from avtorch.gap.engine.coordinates import INDEX, NEUTRAL
+from avtorch.gap.engine.coordinates import EFFECTS, INDEX, NEUTRAL
 from avtorch.gap.engine.demand_filter import (
     coordinate_from_start,
     demand_information,
@@ -33,8 +33,9 @@ from avtorch.gap.engine.demand_filter import (
     take_out,
 )
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.gauss_newton import fit, jacobian, prior_terms
+from avtorch.gap.engine.gauss_newton import jacobian, objective, prior_terms, whitened_jacobian
 from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import SHIFT_NATS, WARM_S
 
 LEVEL_STEP_MPS = 0.1
@@ -54,6 +55,9 @@ _PASSES = 3  # of levels given parameters, parameters given levels
 _NEAR_MPS = 0.6  # how far a level moves at once
 _FINE_MPS = 0.02  # resolution of its place
 _DISTINCT_MPS = 0.05  # smaller dips of the speed are noise
+_MOST_HYSTERESIS_MPS = 4.0  # a gear that has not changed back by then never does
+_LEAST_DEPTH = 0.05  # a level that does nothing cannot be placed
+_LEAST_NATS = 0.5  # a change that gains less is none
 
 
 def shift_speeds(h: Hypothesis) -> tuple[FloatArray, float]:
@@ -82,23 +86,65 @@ def refined_shift_speeds(h: Hypothesis) -> Hypothesis:
     gains."""
     best = h
     for _ in range(_PASSES):
-        values = best.values.copy()
-        values[INDEX["shift_depth"]] = 0.0
-        likelihood = _PulseLikelihood.of(best, best.data.measured - best.response(values))
-        levels, hysteresis, depth = _ascended(
-            likelihood, best.shift_speeds, best["shift_hysteresis"], best["shift_depth"], best["shift_duration"]
-        )
-        same = np.array_equal(levels, best.shift_speeds) and hysteresis == best["shift_hysteresis"]
-        if not len(levels) or same:
+        shifts = _Shifts(best)
+        if not (shifts.ascend() or best is h) or not shifts.levels:
             break
         new = best.copy()
-        new.shift_speeds = levels
-        new["shift_hysteresis"], new["shift_depth"] = hysteresis, depth
-        fit(new, 4)
-        if _objective(new) <= _objective(best) + 0.5:
+        new.shift_speeds = np.array(sorted(shifts.levels))
+        new["shift_hysteresis"], new["shift_depth"] = shifts.hysteresis, shifts.depth
+        new["shift_duration"] = shifts.duration
+        new = fit_with_speeds(new)
+        if _objective(new) <= _objective(best) + _LEAST_NATS:
             break
         best = new
     return best
+
+
+def fit_with_speeds(h: Hypothesis, iterations: int = 4) -> Hypothesis:
+    """The hypothesis at the maximum of `objective` with its shift speeds free, too, by Gauss-Newton.
+
+    An upshift is read between rows, so the response is differentiable in a speed. Speeds and the duration belong
+    together: an interruption that begins early looks long.
+    """
+    names = h.free
+    at = [INDEX[n] for n in names]
+    low, high = np.array([h.limits(n) for n in names]).T
+    h = h.copy().evaluate()
+    for _ in range(iterations):
+        W = whitened_jacobian(h, np.concatenate([jacobian(h, names), _speed_derivatives(h)]))
+        precision, pull = prior_terms(h, names)
+        none = np.zeros(len(h.shift_speeds))
+        H = W @ W.T
+        H += np.diag(np.append(precision, none) + 1e-3 * np.diag(H) + 1e-12)
+        step = np.linalg.solve(H, W @ whiten(h.data, h.covariance, h.residual) + np.append(pull, none))
+        better = None
+        for share in (1.0, 0.5, 0.2):
+            new = h.copy()
+            new.values[at] = np.clip(h.values[at] + share * step[: len(at)], low, high)
+            new.shift_speeds = h.shift_speeds + share * np.clip(step[len(at) :], -_NEAR_MPS, _NEAR_MPS)
+            if (np.diff(new.shift_speeds) > 0).all() and objective(new.evaluate()) > objective(h):
+                better = new
+                break
+        if better is None:
+            break
+        gain, h = objective(better) - objective(h), better
+        if gain < 0.1 * _LEAST_NATS:
+            break
+    return h
+
+
+def _speed_derivatives(h: Hypothesis) -> FloatArray:
+    """Derivatives (gear, channel, frame, bin) of the response by the shift speeds."""
+    out = np.empty((len(h.shift_speeds), *h.predicted.shape))
+    for k in range(len(h.shift_speeds)):
+        responses = []
+        for change in (_FINE_MPS, -_FINE_MPS):
+            new = h.copy()
+            new.shift_speeds = h.shift_speeds.copy()
+            new.shift_speeds[k] += change
+            responses.append(new.response())
+        out[k] = (responses[0] - responses[1]) / (2 * _FINE_MPS)
+    return out
 
 
 def upshift_rows(data: DriveData, speeds: FloatArray) -> BoolArray:
@@ -230,98 +276,111 @@ def _pursued(
     return np.array(sorted(chosen)), total
 
 
-def _ascended(
-    likelihood: _PulseLikelihood, start: FloatArray, hysteresis: float, depth: float, duration: float
-) -> tuple[FloatArray, float, float]:
-    """Levels, hysteresis [m/s] and common depth at a maximum, coordinate by coordinate."""
-    coarse = np.round(_levels(likelihood.data), 2)
-    levels = [float(g) for g in start]
-    best = _Set(likelihood, levels, hysteresis, duration)
-    depth = best.best_depth() if best.levels else depth
-    for _ in range(_PASSES):
-        before = best.nats(depth)
-        for g in list(best.levels):
-            near = np.round(g + np.arange(-_NEAR_MPS, _NEAR_MPS + 1e-9, _FINE_MPS), 2)
-            best.replace(g, np.append(near[near > LOWEST_MPS], g), depth)
-        while len(best.levels) < _MOST_LEVELS and best.replace(None, coarse, depth):
-            pass
-        for other in _hystereses(likelihood.data, best.levels, best.hysteresis):
-            new = _Set(likelihood, best.levels, other, duration)
-            if new.nats(depth) > best.nats(depth) + 0.5:
-                best = new
-        if not best.levels:
-            break
-        depth = best.best_depth()
-        if best.nats(depth) < before + 0.5:
-            break
-    return np.array(sorted(best.levels)), best.hysteresis, depth
+class _Shifts:
+    """`levels` [m/s] with one `depth`, one `hysteresis` [m/s] and one duration of interruptions, and the `score` (row,)
+    beside all of them. All gains are of changes, so that what they leave as it is need not be computed."""
 
+    def __init__(self, h: Hypothesis) -> None:
+        self.likelihood = _PulseLikelihood.of(h, h.residual)
+        self.score = self.likelihood.score.copy()
+        self.levels = [float(g) for g in h.shift_speeds]
+        self.depth, self.hysteresis, self.duration = h["shift_depth"], h["shift_hysteresis"], h["shift_duration"]
+        if self.depth < _LEAST_DEPTH:  # speeds at which nothing happens: from none
+            self.levels, (self.depth, self.duration) = [], EFFECTS["gear_shift"].starts[0]
+        self._known: dict[tuple[float, float], tuple[_Pulses, _Size]] = {}
 
-class _Set:
-    """A set of levels with one hysteresis [m/s] and one duration [s] of interruptions."""
+    def ascend(self) -> bool:
+        """Change levels, hysteresis and depth in turn while that gains; whether anything did."""
+        coarse = np.round(_levels(self.likelihood.data), 2)
+        near = np.arange(-_NEAR_MPS, _NEAR_MPS + 1e-9, _FINE_MPS)
+        total = 0.0
+        for _ in range(_PASSES):
+            gained = sum(self._move(g, np.round(g + near, 2)) for g in list(self.levels))
+            while len(self.levels) < _MOST_LEVELS and (more := self._add(coarse)) > 0.0:
+                gained += more
+            gained += self._rearm() + self._deepen()
+            total += gained
+            if gained < _LEAST_NATS:
+                break
+        return total >= _LEAST_NATS
 
-    def __init__(self, likelihood: _PulseLikelihood, levels: list[float], hysteresis: float, duration: float) -> None:
-        self.likelihood, self.hysteresis, self.duration = likelihood, hysteresis, duration
-        self.levels = list(levels)
-        self._known: dict[float, tuple[_Pulses, _Size]] = {}
+    def _pulses(self, level: float, hysteresis: float) -> tuple[_Pulses, _Size]:
+        key = level, hysteresis
+        if key not in self._known:
+            pulses = self.likelihood.pulses(self.likelihood.upshifts(level, hysteresis), self.duration)
+            self._known[key] = pulses, self.likelihood.size(pulses)
+        return self._known[key]
 
-    def _pulses(self, level: float) -> tuple[_Pulses, _Size]:
-        if level not in self._known:
-            pulses = self.likelihood.pulses(self.likelihood.upshifts(level, self.hysteresis), self.duration)
-            self._known[level] = pulses, self.likelihood.size(pulses)
-        return self._known[level]
+    def _gain(self, level: float) -> float:
+        """Nats of one more level, less its price."""
+        pulses, size = self._pulses(level, self.hysteresis)
+        return self.depth * (self.likelihood.gain(self.score, pulses) - 0.5 * self.depth * size.own) - SHIFT_NATS
 
-    def _slope_and_size(self) -> tuple[float, float]:
-        """-s~' p and p' A~ p of all pulses together."""
-        each = [self._pulses(g)[0] for g in self.levels]
-        if not each:
-            return 0.0, 0.0
-        first = np.concatenate([p.first for p in each])
-        values = np.zeros((len(first), max(p.values.shape[1] for p in each)))
-        done = 0
-        for p in each:
-            values[done : done + len(p.first), : p.values.shape[1]] = p.values
-            done += len(p.first)
-        order = np.argsort(first, kind="stable")
-        together = _Pulses(first[order], values[order])
-        return self.likelihood.gain(self.likelihood.score, together), self.likelihood.size(together).own
+    def _put(self, level: float, depth: float) -> None:
+        self.likelihood.take_out(self.score, *self._pulses(level, self.hysteresis), depth)
 
-    def best_depth(self) -> float:
-        slope, size = self._slope_and_size()
-        return min(max(slope / max(size, 1e-9), 0.05), 1.0)
+    def _move(self, level: float, by: FloatArray) -> float:
+        """Put the best of the levels `by` in place of one, or leave it out where none is worth its price."""
+        self.levels.remove(level)
+        self._put(level, -self.depth)
+        before = self._gain(level)
+        added = self._add(np.append(by[by > LOWEST_MPS], level))
+        return added - before
 
-    def nats(self, depth: float) -> float:
-        """Gain of the set less `SHIFT_NATS` a level."""
-        slope, size = self._slope_and_size()
-        return depth * (slope - 0.5 * depth * size) - SHIFT_NATS * len(self.levels)
+    def _add(self, levels: FloatArray) -> float:
+        """Add the best of `levels` apart from the others, if it is worth its price; what it gains."""
+        if self.levels:
+            levels = levels[_apart(levels, np.array(self.levels))]
+        gains = np.array([self._gain(float(g)) for g in levels])
+        if not len(gains) or gains.max() <= 0.0:
+            return 0.0
+        k = int(gains.argmax())
+        self.levels.append(float(levels[k]))
+        self._put(self.levels[-1], self.depth)
+        return float(gains[k])
 
-    def replace(self, level: float | None, by: FloatArray, depth: float) -> bool:
-        """Put the best of the levels `by` in place of `level` (None: beside all), or leave it out where none gains more
-        than `SHIFT_NATS`; whether there is one."""
-        if level is not None:
-            self.levels.remove(level)
-        by = by[_apart(by, np.array(self.levels))] if self.levels else by
-        score = self.likelihood.score.copy()
-        for g in self.levels:
-            self.likelihood.take_out(score, *self._pulses(g), depth)
-        gains = np.zeros(len(by))
-        for k, g in enumerate(by):
-            pulses, size = self._pulses(float(g))
-            gains[k] = depth * (self.likelihood.gain(score, pulses) - 0.5 * depth * size.own)
-        if not len(by) or gains.max() <= SHIFT_NATS:
-            return False
-        self.levels.append(float(by[int(gains.argmax())]))
-        return True
+    def _rearm(self) -> float:
+        """Take the best hysteresis: of those between two dips of the speed below a level and back, all are the same."""
+        dips = [dips_below(self.likelihood.data.smooth_speed, self.likelihood.data.starts, g) for g in self.levels]
+        edges = np.unique(np.concatenate([[_DISTINCT_MPS, _MOST_HYSTERESIS_MPS], *dips]))
+        edges = edges[(edges >= _DISTINCT_MPS) & (edges <= _MOST_HYSTERESIS_MPS)]
+        best, gain, score = self.hysteresis, _LEAST_NATS, self.score
+        for other in (0.5 * (edges[1:] + edges[:-1])).tolist():
+            beside = self.score.copy()
+            before, after = self._slope(self.score, other), 0.0
+            for hysteresis, depth in ((self.hysteresis, -self.depth), (other, self.depth)):
+                for g in self.levels:
+                    self.likelihood.take_out(beside, *self._pulses(g, hysteresis), depth)
+            after = self._slope(beside, other)
+            # s' w - w' A w / 2 = (s' w + (s - A w)' w) / 2, w being the change
+            if 0.5 * (before + after) > gain:
+                best, gain, score = other, 0.5 * (before + after), beside
+        changed = best != self.hysteresis
+        self.hysteresis, self.score = best, score
+        return gain if changed else 0.0
 
+    def _slope(self, score: FloatArray, other: float) -> float:
+        """Of log L along the change to another hysteresis."""
+        return self.depth * math.fsum(
+            self.likelihood.gain(score, self._pulses(g, other)[0])
+            - self.likelihood.gain(score, self._pulses(g, self.hysteresis)[0])
+            for g in self.levels
+        )
 
-def _hystereses(data: DriveData, levels: list[float], now: float) -> list[float]:
-    """One hysteresis [m/s] between each two dips of the speed below a level and back, the only values that differ."""
-    dips = [dips_below(data.smooth_speed, data.starts, g) for g in levels]
-    each = np.unique(np.concatenate([np.zeros(0), *dips]))
-    each = each[(each > _DISTINCT_MPS) & (each < 4.0)]
-    edges = np.concatenate([[_DISTINCT_MPS], each, [4.0]])
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    return middle[np.abs(middle - now) > 1e-9].tolist()
+    def _deepen(self) -> float:
+        """Take the best depth."""
+        beside = self.score.copy()
+        each = [self._pulses(g, self.hysteresis) for g in self.levels]
+        for pulses, size in each:
+            self.likelihood.take_out(beside, pulses, size, 1.0)
+        slope = math.fsum(self.likelihood.gain(self.score, pulses) for pulses, _ in each)
+        size = slope - math.fsum(self.likelihood.gain(beside, pulses) for pulses, _ in each)
+        if size <= 0.0:
+            return 0.0
+        more = min(max(slope / size, _LEAST_DEPTH - self.depth), 1.0 - self.depth)
+        self.score += more * (beside - self.score)
+        self.depth += more
+        return more * (slope - 0.5 * more * size)
 
 
 @njit(cache=True)
@@ -411,12 +470,16 @@ def _dots(rows: FloatArray, first: IntArray, values: FloatArray) -> FloatArray: 
 
 
 @njit(cache=True, fastmath=True)
-def _energy(
+def _energy(  # pragma: no cover - compiled
     first: IntArray, values: FloatArray, information: FloatArray, cover: FloatArray
-) -> float:  # pragma: no cover - compiled
-    """p' A p of all pulses together."""
-    total = 0.0
+) -> float:
+    """p' D A D p of all pulses together, which are in order of time."""
     reach, rows = len(information), values.shape[1]
+    seen = values.copy()
+    for e in range(len(first)):
+        for j in range(rows):
+            seen[e, j] *= cover[min(first[e] + j, len(cover) - 1)]
+    total = 0.0
     for e in range(len(first)):
         for f in range(e, len(first)):
             apart = first[f] - first[e]
@@ -424,13 +487,11 @@ def _energy(
                 break
             both = 0.0
             for i in range(rows):
-                if values[e, i] == 0.0:
-                    continue
-                for j in range(rows):
-                    lag = abs(apart + j - i)
-                    if lag < reach:
-                        both += values[e, i] * values[f, j] * information[lag]
-            both *= cover[first[e]] * cover[first[f]]
+                if seen[e, i] != 0.0:
+                    for j in range(rows):
+                        lag = abs(apart + j - i)
+                        if lag < reach:
+                            both += seen[e, i] * seen[f, j] * information[lag]
             total += both if e == f else 2.0 * both
     return float(total)
 

@@ -21,6 +21,10 @@ from avtorch.gap.simulator.plant import GapPlant
 Progress = Callable[[str, int, int], None]
 
 
+RANDOM = ("gust", "road_grade", "outliers")
+"""Causes that chance decides and that no plant of the engine has: they are in the noise's spectrum and tails."""
+
+
 @dataclass(frozen=True, eq=False)
 class Inference:
     """The posterior of a car's drives: `base`, the `search` and its `average`; `alone`: judged by one channel, or below
@@ -31,12 +35,17 @@ class Inference:
     average: ModelAverage
     alone: bool
 
+    @property
+    def data(self) -> DriveData:
+        """The drives as they were judged: in phase, without outliers."""
+        return self.base.data
+
 
 def infer(
     data: DriveData,
     *,
     baseline: GapPlant | None = None,
-    effects: Collection[str] = (*EFFECTS, "gust", "road_grade", "outliers"),
+    effects: Collection[str] = (*EFFECTS, *RANDOM),
     most: int | None = None,
     prior: Mapping[str, float] | None = None,
     stop: Callable[[], bool] | None = None,

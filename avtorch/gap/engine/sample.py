@@ -1,14 +1,13 @@
 """Posterior draws of a hypothesis's coordinates: by SGLD, by importance where SGLD fails, or Laplace's.
 
 The sampler is the project's own (`avtorch.inference`), with parallel chains, whitened at the mode of a `Surrogate`.
-Most of its gradients are the surrogate's, corrected at random steps; how often follows from the surrogate's error. Chains
-must agree (nested R-hat), and draws satisfy Stein's identity of the exact density. All draws are of the tempered
+Most of its gradients are the surrogate's, corrected at random steps; how often follows from the surrogate's error.
+Chains must agree (nested R-hat), and draws satisfy Stein's identity of the exact density. All draws are of the tempered
 density; then they are stretched to cover what parts of the drive disagree on (`laplace`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -18,13 +17,12 @@ from torch import Tensor
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.gap.engine.coordinates import COORDINATES, EFFECTS, base_name
 from avtorch.gap.engine.density import HypothesisDensity
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.laplace import Laplace
 from avtorch.gap.engine.priors import TEMPER
-from avtorch.gap.engine.surrogate import Corrected, Surrogate, terms_of, trusted_square
-from avtorch.gap.engine.torch_plant import not_in_torch, own_value
+from avtorch.gap.engine.surrogate import Corrected, Surrogate, reach, terms_of
+from avtorch.gap.engine.torch_plant import not_in_torch
 from avtorch.inference.coordinates import Coordinates, stiffness
 from avtorch.inference.importance import ImportanceSettings, weighted_draws
 from avtorch.inference.map import Mode, find_mode
@@ -36,24 +34,27 @@ from avtorch.inference.sampler_settings import SamplerSettings
 STEP = 2.0
 """SGLD's step in whitened coordinates; see `SamplerSettings`."""
 
-_INFLATED = 0.02  # relative increase of a variance by gradient noise
+_INFLATED = 0.05  # relative increase of a variance by gradient noise
 _THROWN = 3.0  # [posterior standard deviations] largest displacement by one correction
 _RAREST = 16.0  # steps between corrections
 _CLIFF = 9.0  # mean square error of the surrogate's whitened gradient above which no step suits the density
 _STEPS = 500.0  # of SGLD, most
-_GRADIENT_STEPS = 1.6e7  # of the grid in exact gradients, most: ten seconds on one core
+_GRADIENT_STEPS = 1.2e7  # of the grid in exact gradients of the walk, most: five seconds on one core
 _LONGEST = 1_000_000  # steps of a grid whose responses fit in memory
 _CHECKED = 96  # draws that Stein's identity is checked at
 _LET_PASS = 0.15  # relative error of a variance
+_WIDER = 1.2  # spread of the surrogate's responses over that of the draws
+_SOUGHT = ImportanceSettings(rounds=4, enough=150.0)  # draws of the surrogate that the next one is fitted to
+_WEIGHED = ImportanceSettings(draws=200, rounds=4, enough=200.0)
 _FEWEST = 30.0  # effective draws by importance
 
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Draws `x` (chain, draw, coordinate) of the coordinates `names`; one that stands at a limit out of reach is constant.
+    """Draws `x` (chain, draw, coordinate) of the coordinates `names`; one at a limit that is out of reach is constant.
 
-    `method`: "sgld"; "importance" where the density is too steep in places for Langevin steps; "laplace" where both fail
-    or there is no gradient; `why` says so. `effective`: effective number of draws of the slowest coordinate.
+    `method`: "sgld"; "importance" where the density is too steep in places for Langevin steps; "laplace" where both
+    fail or there is no gradient; `why` says so. `effective`: effective number of draws of the slowest coordinate.
     `exact_share`: share of exact gradients. `widened`: largest factor on a standard deviation for what parts of the
     drive disagree on.
     """
@@ -69,16 +70,6 @@ class Draws:
     def __getitem__(self, name: str) -> FloatArray:
         """Draws (chain, draw) of a coordinate."""
         return self.x[..., self.names.index(name)]
-
-    def of_plant(self, h: Hypothesis) -> dict[str, FloatArray]:
-        """Draws (chain, draw) under the names of a plant's parameters, in their own units (`GapPlant.with_values`)."""
-        out = {name: self[name] for name in ("T_L", "K_L")}
-        for effect in h.effects:
-            for c in EFFECTS[effect].coordinates:
-                if c.parameter:
-                    own = own_value(COORDINATES[c.name], torch.as_tensor(self[c.name])).numpy()
-                    out[f"{base_name(effect)}.{c.parameter}"] = own
-        return out
 
 
 def sample(
@@ -108,7 +99,7 @@ def sample(
     if not why:
         density = HypothesisDensity(h, temper, normal.names, np.sqrt(np.diag(normal.covariance)))
         generator = torch.Generator().manual_seed(seed)
-        found, why = _sampled(density, normal, chains, draws, generator, rng)
+        found, why = _sampled(density, normal, chains, draws, generator)
     if found is None:
         x = normal.draws(chains * draws, rng, widen=widen).reshape(chains, draws, -1)
         found = Draws(normal.names, x, "laplace", float(chains * draws), 0.0, why=why)
@@ -131,20 +122,19 @@ def _sampled(
     chains: int,
     draws: int,
     generator: torch.Generator,
-    rng: np.random.Generator,
 ) -> tuple[Draws | None, str]:
     """Draws of the density by SGLD or importance; None where neither can be had; and why not by SGLD."""
-    surrogate, mode = fitted(density, normal, rng)
-    points = exact_one_in(density, surrogate, mode, generator)
-    target = Corrected(density, surrogate, mode, max(points, 1))
+    surrogate, mode = fitted(density, normal, generator)
+    steepness = float(stiffness(density, Coordinates.of(mode)))
+    points = exact_one_in(density, surrogate, mode, steepness, generator)
+    target = Corrected(density, surrogate, max(points, 1))
     z, why = None, "gradients jump within a posterior standard deviation"
     if points:
-        z, why = _walked(target, chains, draws, generator)
+        z, why = _walked(target, mode, steepness, chains, draws, generator)
     if z is not None:
         x, worth = density.constrain(z), float(effective_sample_size(z).min())
         return Draws(density.names, x.numpy(), "sgld", worth, 1 / points), ""
-    settings = ImportanceSettings(draws=200, rounds=4, enough=200.0)
-    weighted = weighted_draws(target, settings, generator=generator, mode=mode)
+    weighted = weighted_draws(target, _WEIGHED, generator=generator, mode=mode)
     worth = float(weighted.effective[0])
     if worth < _FEWEST or not float(weighted.pareto_k[0]) < reliable(len(weighted.z)):
         return None, f"{why}; importance weights are not reliable either"
@@ -152,25 +142,20 @@ def _sampled(
     return Draws(density.names, density.constrain(z).numpy(), "importance", worth, why=why), why
 
 
-def fitted(density: HypothesisDensity, normal: Laplace, rng: np.random.Generator) -> tuple[Surrogate, Mode]:
-    """A surrogate around the density's mode, and that mode."""
+def fitted(density: HypothesisDensity, normal: Laplace, generator: torch.Generator) -> tuple[Surrogate, Mode]:
+    """A surrogate where the density has its mass, and its mode."""
     count = 2 * terms_of(len(normal.mean)) + 8
-    x = normal.draws(count, rng, widen=False, times=1.2)
-    for turn in range(3):
-        surrogate = Surrogate.of(density, x)
+    rng = np.random.default_rng(generator.initial_seed())
+    surrogate = Surrogate.of(density, normal.draws(count, rng, widen=False, times=_WIDER))
+    for _ in range(2):
         mode = find_mode(surrogate)
-        if turn == 2 or not bool(mode.converged[0]):
-            break
-        slope = torch.autograd.functional.jacobian(density.constrain, mode.z[0])
-        away = torch.linalg.solve(surrogate.scale, density.constrain(mode.z[0]) - surrogate.centre)
-        spread = 1.2 * torch.linalg.svdvals(torch.linalg.solve(surrogate.scale, slope @ mode.scale[0]))
-        if float(away.abs().max()) < 0.5 and float(spread.max()) < 1.6 and float(spread.min()) > 0.6:
-            break
-        z = mode.z[0] + 1.2 * torch.as_tensor(rng.standard_normal((count, len(slope)))) @ mode.scale[0].mT
-        x = density.constrain(z).numpy()
-    if not bool(mode.converged[0]):  # far from any quadratic: Laplace's
-        mode = _normal_mode(density, normal)
-    return surrogate, Mode(mode.z, mode.scale, density.value(mode.z), mode.converged)
+        if not bool(mode.converged[0]):  # far from any quadratic: Laplace's
+            return surrogate, _normal_mode(density, normal)
+        z = weighted_draws(surrogate, _SOUGHT, generator=generator, mode=mode).equal(count, generator)[:, 0]
+        wider = z.mean(0) + _WIDER * (z - z.mean(0))
+        surrogate = Surrogate.of(density, density.constrain(wider).numpy())
+    mode = find_mode(surrogate, start=mode.z)
+    return surrogate, mode if bool(mode.converged[0]) else _normal_mode(density, normal)
 
 
 def _normal_mode(density: HypothesisDensity, normal: Laplace) -> Mode:
@@ -181,19 +166,23 @@ def _normal_mode(density: HypothesisDensity, normal: Laplace) -> Mode:
     return Mode(z[None], scale[None], torch.zeros(1, dtype=z.dtype), torch.tensor([True]))
 
 
-def exact_one_in(density: HypothesisDensity, surrogate: Surrogate, mode: Mode, generator: torch.Generator) -> int:
+def exact_one_in(
+    density: HypothesisDensity, surrogate: Surrogate, mode: Mode, steepness: float, generator: torch.Generator
+) -> int:
     """The interval n at which gradients must be exact, so that their noise widens the posterior within tolerance.
 
-    Noise of variance s² in whitened gradients widens a variance by `step s² / 4`. Correcting one gradient in n leaves
-    `(n - 1)` times the squared error of the surrogate, measured at slightly widened draws from Laplace's approximation.
-    0 where that error is so large that the density is too steep for SGLD. At the limit of the surrogate's range, a
-    single correction must not displace a chain far either.
+    Noise of variance s² in whitened gradients widens a variance by `step s² / 4`, with the step that suits the
+    `steepness`. Correcting one gradient in n leaves `(n - 1)` times the squared error of the surrogate, measured at
+    draws like those that it was fitted to. 0 where that error is so large that the density is too steep
+    for SGLD. At the limit of the surrogate's range, a single correction must not displace a chain far either.
     """
     size, count = mode.z.shape[-1], 16
     w = torch.randn(count + size, 1, size, dtype=mode.z.dtype, generator=generator)
-    edge, length = trusted_square(size) ** 0.5, w.norm(dim=-1, keepdim=True)
-    w = torch.cat([1.2 * w[:count] * (edge / (1.2 * length[:count])).clamp_max(1.0), w[count:] * edge / length[count:]])
-    z = mode.z + w @ mode.scale[0].mT
+    out = reach(size) / w.norm(dim=-1, keepdim=True)
+    z = (
+        surrogate.middle
+        + torch.cat([w[:count] * out[:count].clamp_max(1.0), w[count:] * out[count:]]) @ surrogate.spread.mT
+    )
     lacking = (density.score(z) - surrogate.score(z)) @ mode.scale[0]
     if not bool(lacking.isfinite().all()):
         return 0
@@ -201,20 +190,21 @@ def exact_one_in(density: HypothesisDensity, surrogate: Surrogate, mode: Mode, g
     if typical > _CLIFF:
         return 0
     farthest = float(lacking[count:].abs().max().clamp_min(1e-12))
-    return int(min(_RAREST, 1 + 4 * _INFLATED / (STEP * typical), 1 + _THROWN / farthest))
+    step = STEP / steepness
+    return int(min(_RAREST, 1 + 4 * _INFLATED / (step * typical), 1 + _THROWN * STEP / (step * farthest)))
 
 
 def _walked(
-    target: Corrected, chains: int, draws: int, generator: torch.Generator
+    target: Corrected, mode: Mode, steepness: float, chains: int, draws: int, generator: torch.Generator
 ) -> tuple[Tensor | None, str]:
     """SGLD draws of `z` (chain, draw, coordinate), or None and the reason; the number of gradients is bounded."""
-    density, mode = target.exact, target.mode
-    steepness = float(stiffness(density, Coordinates.of(mode)))
+    density = target.exact
     steps = min(_STEPS, _GRADIENT_STEPS / len(density.hypothesis.data.grid.time) * target.points / chains)
     thinning = 2 if draws * 2 + 4 <= steps else 1
     longest = max([1.0, *(t for t in (1.5, 2.0, 3.0, 4.0) if (4 * t + thinning * draws) * t <= steps)])
     if steepness > 2 * longest or thinning * draws + 4 > 2 * steps:
-        return None, f"its shape is far from normal (in places {steepness:.0f} times as steep), SGLD would take too long"
+        steep = f"in places {steepness:.0f} times as steep"
+        return None, f"its shape is far from normal ({steep}), and SGLD would take too long"
     settings = SamplerSettings(
         chains=chains,
         draws=draws,
@@ -240,8 +230,8 @@ def _walked(
 def stein_discrepancy(density: HypothesisDensity, mode: Mode, z: Tensor, generator: torch.Generator) -> float:
     """Largest violation of Stein's identity by draws `z` (chain, draw, coordinate); 0 where it is not significant.
 
-    Under the density the mean of `(w - mean) dU/dw` is 1 for each coordinate. A share of the variance and three standard
-    errors are tolerated.
+    Under the density the mean of `(w - mean) dU/dw` is 1 for each coordinate. A share of the variance and three
+    standard errors are tolerated.
     """
     flat = z.flatten(0, 1)
     some = flat[torch.randperm(len(flat), generator=generator)[:_CHECKED]][:, None]

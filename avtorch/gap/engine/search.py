@@ -20,10 +20,12 @@ from avtorch.gap.engine.evidence import evaluate_evidence
 from avtorch.gap.engine.gauss_newton import fit, jacobian, objective, prior_terms, whitened_jacobian
 from avtorch.gap.engine.gear_shifts import refined_shift_speeds, shift_speeds, upshift_rows
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import whiten
+from avtorch.gap.engine.likelihood import log_likelihood, whiten
 from avtorch.gap.engine.lost_messages import with_lost_messages
 from avtorch.gap.engine.recorder import traded
 
+_MOST_FITS, _FEWEST_FITS = 160, 40  # of a search; a hard case of five minutes takes about fifty
+_GRID_FITS = 4e6  # fits times grid points: what a long drive may cost
 _WIDTH, _LATER_WIDTH = 9, 6  # effects fitted from the base, and from a set
 _FINISHED = 3  # of these, how many are finished
 _CUTS = 12  # onsets at which a response's size is computed; between them it is interpolated
@@ -47,21 +49,26 @@ class Search:
     """A search from a fitted `base`, among `effects`; at most `most` in a set. `alone`: one channel, or the band below
     `ONE_CHANNEL_HZ`: the car's own unnamed dynamics then belong to the base.
 
-    `most_fits` bounds what it may cost, `stop()` ends it where it returns True; `complete` tells whether one of them
-    did. `visited` maps a set (names, and whether each has an onset) to its best hypothesis.
+    `most_fits` bounds what it may cost (0: by the length of the drive), `stop()` ends it where it returns True;
+    `complete` tells whether one of them did. `visited` maps a set (names, and whether each has an onset) to its
+    best hypothesis.
     """
 
     base: Hypothesis
     effects: Collection[str] = tuple(EFFECTS)
     most: int = 4
     alone: bool = False
-    most_fits: int = 160
+    most_fits: int = 0
     stop: Callable[[], bool] | None = None
     progress: Callable[[str, int, int], None] | None = None
     visited: dict[tuple[tuple[str, bool], ...], Hypothesis] = field(default_factory=dict)
     fits: int = 0
     complete: bool = True
     _shifts_refined: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.most_fits:
+            self.most_fits = int(np.clip(_GRID_FITS / len(self.base.data.grid.time), _FEWEST_FITS, _MOST_FITS))
 
     def run(self) -> Hypothesis:
         """The best set found."""
@@ -265,9 +272,24 @@ class _Projection:
         self._basis = np.linalg.qr((A[size > 1e-9] / size[size > 1e-9, None]).T)[0]
         self.residual = r - self._basis @ (self._basis.T @ r)
 
+        self._data = h.data
+        self._start = self._nats(self.residual)
+
     def __call__(self, whitened: FloatArray) -> FloatArray:
         x = np.concatenate([whitened, np.zeros(self.rows)])
         return x - self._basis @ (self._basis.T @ x)
+
+    def nats(self, free: FloatArray) -> float:
+        """What the best multiple of a projected response gains, its size penalised by a unit prior; the noise's
+        covariance is that of what is left, as everywhere: a band's own excess does not hide what explains it."""
+        gain, size = float(free @ self.residual), float(free @ free)
+        shares = gain / (size + 1), gain / max(size, 1e-9)
+        return max(self._nats(self.residual - x * free) - 0.5 * x * x for x in shares) - self._start
+
+    def _nats(self, x: FloatArray) -> float:
+        data = self._data
+        shape = data.channel_count, data.frame_count, data.bin_count
+        return log_likelihood(data, x[: -self.rows].reshape(shape))[0] - 0.5 * float(x[-self.rows :] @ x[-self.rows :])
 
 
 def promises(h: Hypothesis, candidates: Sequence[EngineEffect]) -> list[Promise]:
@@ -314,7 +336,7 @@ def _whole(
     if size <= 1e-6 * float(whitened @ whitened) or (gain <= 0 and e.one_sided):
         return []
     turned = start if gain > 0 or e.name == "driveline_oscillation" else tuple(-x for x in start)
-    return [Promise(0.5 * gain * gain / (size + 1), e.name, turned, None)]
+    return [Promise(projection.nats(free), e.name, turned, None)]
 
 
 def _by_slope(h: Hypothesis, projection: _Projection, e: EngineEffect, start: tuple[float, ...]) -> list[Promise]:
@@ -327,7 +349,7 @@ def _by_slope(h: Hypothesis, projection: _Projection, e: EngineEffect, start: tu
     change = (h.response(p) - h.predicted) * (start[0] / _SLOPES[name])
     free = projection(whiten(h.data, h.covariance, change))
     gain = float(free @ projection.residual)
-    return [Promise(0.5 * gain * gain / (float(free @ free) + 1), e.name, start, None)] if gain > 0 else []
+    return [Promise(projection.nats(free), e.name, start, None)] if gain > 0 else []
 
 
 def _onsets(
@@ -370,7 +392,7 @@ def _onsets(
         n, gain = float(free @ free), float(free @ projection.residual)
         if n > 1e-9 and (gain > 0 or not e.one_sided):
             scaled = tuple(x * float(np.clip(gain / n, -4, 4)) for x in start) if len(start) == 1 else start
-            out.append(Promise(0.5 * gain * gain / (n + 1) - 3.0, e.name, scaled, onset))
+            out.append(Promise(projection.nats(free) - 3.0, e.name, scaled, onset))
         priced[np.abs(data.time - onset) < data.hop_s] = 0
     return out
 

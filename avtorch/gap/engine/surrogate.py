@@ -23,17 +23,20 @@ from torch import Tensor
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.density import HypothesisDensity, WithScore, log_prior, of_products, pairs
-from avtorch.inference.map import Mode
 
 
 @dataclass(frozen=True, eq=False)
 class Surrogate:
-    """`log_prob` of a `density` from quadratics in w, `x = centre + scale w`; `gram` (band, pair, term, term)."""
+    """`log_prob` of a `density` from quadratics in w, `x = centre + scale w`; `gram` (term, band, pair, term).
+
+    `middle` (coordinate,), `spread` (coordinate, coordinate), a triangular root: of the fitted draws in z."""
 
     density: HypothesisDensity
     centre: Tensor
     scale: Tensor
     gram: Tensor = field(repr=False)
+    middle: Tensor
+    spread: Tensor
 
     windows = 1
 
@@ -56,7 +59,10 @@ class Surrogate:
             for p, (i, j) in enumerate(pairs(data)):
                 product = flat[:, i] @ flat[:, j].T
                 gram[b, p] = 0.5 * (product + product.T)
-        return cls(density, torch.as_tensor(centre), torch.as_tensor(scale), torch.as_tensor(gram))
+        first = np.ascontiguousarray(np.moveaxis(gram, -1, 0))
+        z = density.unconstrain(torch.as_tensor(x))
+        tables = (torch.as_tensor(table) for table in (centre, scale, first))
+        return cls(density, *tables, z.mean(0), torch.linalg.cholesky(z.T.cov().reshape(len(centre), -1)))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -67,6 +73,12 @@ class Surrogate:
 
     def constrain(self, z: Tensor) -> Tensor:
         return self.density.constrain(z)
+
+    def covers(self, z: Tensor) -> Tensor:
+        """Whether `z` (..., coordinate) is where the surrogate was fitted: (...)."""
+        away = (z - self.middle).unsqueeze(-1)
+        w = torch.linalg.solve_triangular(self.spread, away, upper=False).squeeze(-1)
+        return w.square().sum(-1) <= reach(z.shape[-1]) ** 2
 
     def log_prob(self, z: Tensor) -> Tensor:
         """Log density (..., 1) of `z` (..., 1, coordinate). Differentiable once."""
@@ -89,13 +101,18 @@ class Surrogate:
             away = (x - self.centre).unsqueeze(-1)
             terms = _terms(torch.linalg.solve_triangular(self.scale, away, upper=False).squeeze(-1))
             rest = log_prior(h, density.names, x) + density.log_slope(z).sum(-1)
-            half = torch.tensordot(terms.detach(), self.gram, ([-1], [-2]))  # (..., band, pair, term)
+            half = torch.tensordot(terms.detach(), self.gram, dims=1)  # (..., band, pair, term)
             products = (half @ terms.detach()[..., None, :, None]).squeeze(-1).requires_grad_()
             likelihood = density.temper * of_products(h.data, products.mT)
             (slope,) = torch.autograd.grad(likelihood.sum(), products)
             of_terms = 2 * (slope[..., None] * half).sum((-3, -2))
             (score,) = torch.autograd.grad((terms * of_terms).sum() + rest.sum(), z)
         return (likelihood + rest).detach(), score
+
+
+def reach(size: int) -> float:
+    """Distance up to which a surrogate is used, in standard deviations of the draws that it was fitted to."""
+    return (size + 2 * (2 * size) ** 0.5) ** 0.5
 
 
 def terms_of(count: int) -> int:
@@ -117,7 +134,6 @@ class Corrected:
 
     exact: HypothesisDensity
     surrogate: Surrogate
-    mode: Mode
     points: int
 
     windows = 1
@@ -144,7 +160,7 @@ class Corrected:
     def log_prob_minibatch(self, z: Tensor, index: Tensor) -> Tensor:
         """Log density of `z` (..., 1, coordinate), its gradient unbiased over uniform `index` in 0 ... points - 1."""
         flat = z.reshape(-1, z.shape[-1])
-        far = ~self.trusted(flat.detach())  # NaN counts as far
+        far = ~self.surrogate.covers(flat.detach())  # NaN counts as far
         share = torch.where(far, 1.0, float((index == 0).sum()) * self.points / len(index))
         value = torch.where(far, 0.0, self.surrogate.log_prob(flat))
         chosen = share.nonzero().squeeze(-1)
@@ -152,13 +168,3 @@ class Corrected:
             return value.reshape(z.shape[:-1])
         apart = self.exact.log_prob(flat[chosen][:, None])[:, 0] - value[chosen]
         return value.index_add(0, chosen, share[chosen] * apart).reshape(z.shape[:-1])
-
-    def trusted(self, z: Tensor) -> Tensor:
-        """Whether the surrogate's gradient may be used at `z` (chain, coordinate)."""
-        w = torch.linalg.solve_triangular(self.mode.scale[0], (z - self.mode.z[0])[..., None], upper=False)[..., 0]
-        return w.square().sum(-1) <= trusted_square(z.shape[-1])
-
-
-def trusted_square(size: int) -> float:
-    """Squared distance from the mode [posterior standard deviations] up to which a surrogate is used."""
-    return size + 4 * (2 * size) ** 0.5

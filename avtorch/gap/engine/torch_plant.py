@@ -4,11 +4,13 @@ It runs the simulator's own effects and actuator on the grid of a drive, stretch
 compiled plant. An effect that sets in later is neutral until then. One whose memory would have filled by then (a play,
 a sensor's filter) begins there at rest; an actuator that changes is cut in two there, and its second part begins at the
 acceleration which the first has reached.
+
+Where a user's own effect or baseline takes part, the simulator responds as a whole.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -19,26 +21,29 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.gap.effects import DrivelineOscillation
-from avtorch.gap.engine.car import table_effect
+from avtorch.gap.engine.car import plant_of, table_effect
 from avtorch.gap.engine.compiled_plant import _FREE_DAMPING
-from avtorch.gap.engine.coordinates import EFFECTS, INDEX, NEUTRAL, Coordinate
+from avtorch.gap.engine.coordinates import EFFECTS, INDEX, NEUTRAL, Coordinate, base_name
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.simulator.actuator import Actuator, Substep
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.effect_context import EffectContext, context_at
 from avtorch.gap.simulator.order import at_place, in_order, substeps
+from avtorch.gap.simulator.plant import GapPlant
+from avtorch.gap.simulator.simulator_input import SimulatorInput
 
 Values = Mapping[str, Tensor]
 """Coordinates by name, (column,) each, or () where all columns share the value."""
 
 _FILLING = frozenset({"backlash", "sensor_lag"})
 _UNNAMED = "~linear"
+_NO_LIMIT = 1e9  # [m/s², m/s³] replaces infinity, whose gradients are undefined
 
 
 def own_value(c: Coordinate, z: Tensor) -> Tensor:
-    """The effect's own parameter at coordinates `z`: `Coordinate.value` of a tensor."""
+    """The effect's own parameter at coordinates `z`: `Coordinate.value` of a tensor, but finite without a limit."""
     if c.link == "inverse":
-        z = torch.where(z > 1e-9, 1 / z.clamp_min(1e-9), torch.inf)
+        z = 1 / z.clamp_min(1 / _NO_LIMIT)
     elif c.link == "log":
         z = z.exp()
     elif c.link == "square":
@@ -50,10 +55,49 @@ def own_value(c: Coordinate, z: Tensor) -> Tensor:
 
 def not_in_torch(h: Hypothesis) -> str:
     """Why there is no such plant of a hypothesis; empty where there is one."""
+    late = [e for e in h.onsets if e != "gain_change"]
+    if late and _by_the_simulator(h):
+        return f"{' and '.join(late)} set in beside what the simulator alone has"
     actuator = [e for e in h.effects if EFFECTS[e].base in ("second_order_actuator", "rate_limit")]
     if len(actuator) > 1 and any(e in h.onsets for e in actuator):
         return f"{' and '.join(actuator)} change the actuator at different times"
     return ""
+
+
+def torch_plant(h: Hypothesis) -> TorchPlant | SimulatorPlant:
+    """The plant of a hypothesis. Raises `InputError` where `not_in_torch` has a reason."""
+    why = not_in_torch(h)
+    if why:
+        raise InputError(f"hypothesis: {why}, needs effects from the start")
+    return SimulatorPlant.of(h) if _by_the_simulator(h) else TorchPlant.of(h)
+
+
+def _by_the_simulator(h: Hypothesis) -> bool:
+    return h.baseline is not None or any(EFFECTS[e].kind is not None for e in h.effects)
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatorPlant:
+    """`Hypothesis.on_grid` by the simulator's own plant, for tensors of values."""
+
+    hypothesis: Hypothesis
+    plant: GapPlant
+    drives: tuple[SimulatorInput, ...]
+
+    @classmethod
+    def of(cls, h: Hypothesis) -> SimulatorPlant:
+        return cls(h, plant_of(h, h.baseline), tuple(drives_of(h)))
+
+    def on_grid(self, values: Values) -> tuple[Tensor, Tensor]:
+        """See `TorchPlant.on_grid`."""
+        own = {name: values[name] for name in ("T_L", "K_L")}
+        for effect in self.hypothesis.effects:
+            for c in EFFECTS[effect].coordinates:
+                if c.parameter:
+                    own[f"{base_name(effect)}.{c.parameter}"] = own_value(c, values[c.name])
+        responses = [self.plant.response(drive, own) for drive in self.drives]
+        gained = [r.speed - r.speed[..., :1] for r in responses]
+        return torch.cat([r.accel_measured for r in responses], -1), torch.cat(gained, -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,10 +119,6 @@ class TorchPlant:
 
     @classmethod
     def of(cls, h: Hypothesis) -> TorchPlant:
-        """Raises `InputError` where `not_in_torch` has a reason."""
-        why = not_in_torch(h)
-        if why:
-            raise InputError(f"hypothesis: {why}, needs one onset for both")
         grid = h.data.grid
         begins = np.flatnonzero(grid.starts).tolist()
         command = h.command()[grid.row]
@@ -149,6 +189,7 @@ class TorchPlant:
             return DrivelineOscillation(frequency, zero, 2 * np.pi * frequency * pole, zero + _FREE_DAMPING)
         effect = table_effect(self.hypothesis, name)
         neutral = {p.name: p.neutral for p in effect.coordinates() if p.neutral is not None}
+        neutral = {k: min(max(x, -_NO_LIMIT), _NO_LIMIT) for k, x in neutral.items()}
         own = {c.parameter: own_value(c, z[c.name])[..., None] for c in coordinates}
         if first and effect.name not in _FILLING and effect.own_onset is None:
             acts = torch.arange(len(time)) >= first
@@ -157,17 +198,24 @@ class TorchPlant:
         return effect.replaced(rest | own)
 
 
+def drives_of(h: Hypothesis) -> Iterator[SimulatorInput]:
+    """The stretches of a hypothesis's drives as the simulator's inputs, on the grid."""
+    grid, command = h.data.grid, h.command()[h.data.grid.row]
+    for i, j in pairwise([*np.flatnonzero(grid.starts).tolist(), len(grid.time)]):
+        speed = None if h.data.speed is None else torch.as_tensor(grid.speed[i:j])
+        time, sent = torch.as_tensor(grid.time[i:j]), torch.as_tensor(command[i:j])
+        yield SimulatorInput(time, sent, speed, float(grid.accel0[i]), h.data.accel_kind == "specific-force")
+
+
 def _acting(h: Hypothesis) -> list[str]:
     """The hypothesis's effects, and those of its baseline: what is not neutral in the vector."""
     acting = [e for e in h.effects if e != "command_hold"]
     fitted = {c.name for e in acting for c in EFFECTS[e].coordinates}
     for effect in EFFECTS.values():
-        own = [c for c in effect.coordinates if c.mean is None]
         names = {c.name for c in effect.coordinates}
-        if names & fitted or all(h[c.name] == NEUTRAL[INDEX[c.name]] for c in own):
-            continue
-        acting.append(effect.name)
-        fitted |= names
+        if effect.kind is None and not names & fitted and any(h[n] != NEUTRAL[INDEX[n]] for n in names):
+            acting.append(effect.name)
+            fitted |= names
     return acting
 
 

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.drive_record import Record
+from avtorch.gap.counted import Counted
 from avtorch.gap.result.repeatability import Repeatability, repeatability
 from avtorch.gap.rollout_errors import HORIZON_S, RolloutMetric, reached, rms
-from avtorch.gap.search.fitted_model import FittedModel, SearchResult
+
+
+class Simulated(NamedTuple):
+    """A simulator's `errors` (channel, row, group), measured less simulated, and its `lag` [s]."""
+
+    errors: FloatArray
+    lag: float
 
 
 @dataclass(frozen=True)
@@ -47,19 +53,25 @@ class GapSize:
         }
 
 
-def gap_size(race: SearchResult, best: FittedModel, *, detected: bool, p_value: float | None = None) -> GapSize:
-    """Root mean square errors of `race.none`, the fitted baseline, with those of `best` as floors where smaller.
+def gap_size(
+    rows: Counted,
+    none: Simulated,
+    best: Simulated,
+    *,
+    detected: bool,
+    p_value: float | None = None,
+) -> GapSize:
+    """Root mean square errors of `none`, the fitted baseline, with those of `best` as floors where smaller.
 
     (An effect may improve the speed at the cost of the acceleration, and a wrong one often does.) Rollouts start from
     the measurement at every row, and last `HORIZON_S` or as long as the longest stretch: the measures are those of
     `shrinkage`, here over all counted rows. None where the log lacks the channel.
     """
-    none, record = race.none, race.record
-    one, lag = [], none.values["T_L"]
-    if record.accel is not None:
-        one = [_one_step(record, f.errors[0], f.values["T_L"]) for f in (none, best)]
-    usual = {name: RolloutMetric(name, HORIZON_S) for name in record.channels}
-    rollout = {name: [rms(m, record, f.errors, lag) for f in (none, best)] for name, m in usual.items()}
+    one: list[float] = []
+    if rows.accel is not None:
+        one = [_one_step(rows, x.errors[0], x.lag) for x in (none, best)]
+    usual = {name: RolloutMetric(name, HORIZON_S) for name in rows.channels}
+    rollout = {name: [rms(m, rows, x.errors, none.lag) for x in (none, best)] for name, m in usual.items()}
     accel, speed = (rollout.get(name, []) for name in ("accel", "speed"))
     return GapSize(
         detected=detected,
@@ -69,12 +81,12 @@ def gap_size(race: SearchResult, best: FittedModel, *, detected: bool, p_value: 
         rollout_rmse_accel=accel[0] if accel else None,
         rollout_floor_accel=min(accel, default=None),
         rollout_rmse_speed=speed[0] if speed else None,
-        horizon_s=reached(usual[record.channels[0]], record),
-        repeats=repeatability(record),
+        horizon_s=reached(usual[rows.channels[0]], rows),
+        repeats=repeatability(rows),
     )
 
 
-def _one_step(record: Record, errors: FloatArray, lag: float) -> float:
+def _one_step(record: Counted, errors: FloatArray, lag: float) -> float:
     """RMS error of the acceleration predicted for a row from the measurement one row earlier.
 
     A rollout error decays with the lag, so the one-step error is `e[k+1] - exp(-dt / T_L) e[k]`: for GLVD exactly the
@@ -85,7 +97,7 @@ def _one_step(record: Record, errors: FloatArray, lag: float) -> float:
     return _size(np.concatenate(steps))
 
 
-def _stretches(record: Record, values: FloatArray) -> list[FloatArray]:
+def _stretches(record: Counted, values: FloatArray) -> list[FloatArray]:
     """`values` (counted, ...) of each stretch without gaps."""
     return np.split(values, record.starts[1:])
 

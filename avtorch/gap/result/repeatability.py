@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.drive_record import Record
+from avtorch.gap.counted import Counted
 
 WINDOW_S = 10.0
 SETTLED_S = 3.0
@@ -47,7 +47,7 @@ class Repeatability:
         }
 
 
-def repeatability(record: Record) -> Repeatability | None:
+def repeatability(record: Counted) -> Repeatability | None:
     """The repeatability from windows with repeated commands; None where there are none."""
     rows, settled = round(WINDOW_S / record.dt), round(SETTLED_S / record.dt)
     found = list(_pairs(record.command[record.source], record.stretch, rows))

@@ -26,7 +26,8 @@ DT, LAG = 0.02, 0.3
 def _hypothesis(rng: np.random.Generator, *, both: bool = True) -> Hypothesis:
     """A fitted car with coloured noise, driven by steps, behind a recorder that makes both channels late."""
     time = np.arange(0.0, 100.0, DT)
-    command = np.repeat(rng.normal(0.0, 1.0, len(time) // 100), 100)
+    levels = rng.normal(0.0, 1.0, len(time) // 200)
+    command = np.repeat(np.stack([levels, -levels], 1).ravel(), 100)  # the speed stays near its start
     keep, accel = np.exp(-DT / LAG), np.zeros(len(time))
     for k in range(1, len(time)):
         accel[k] = command[k - 1] + keep * (accel[k - 1] - command[k - 1])
@@ -42,12 +43,11 @@ def _inner(h: Hypothesis, x: FloatArray, y: FloatArray) -> float:
     return float(np.einsum("cfk,kce,efk->", x, precision(h.data, h.covariance), y))
 
 
-@pytest.mark.parametrize("both", [True, False])
-@pytest.mark.parametrize("dead_time", [0.0, 0.13])
+@pytest.mark.parametrize(("both", "dead_time"), [(True, 0.0), (False, 0.0), (True, 0.13)])
 def test_score_and_information_are_those_of_the_simulated_response(
-    rotating_seed: int, both: bool, dead_time: float
+    fresh_seed: int, both: bool, dead_time: float
 ) -> None:
-    rng = np.random.default_rng(rotating_seed)
+    rng = np.random.default_rng(fresh_seed)
     h = _hypothesis(rng, both=both)
     if dead_time:
         h = h.with_effect("dead_time", (dead_time,)).evaluate()
@@ -55,23 +55,26 @@ def test_score_and_information_are_those_of_the_simulated_response(
     score = demand_score(h, h.covariance, h.residual)
     information = demand_information(h, h.covariance, 100)
     steps = np.flatnonzero(np.diff(data.command)) + 1
-    inside = steps[(steps > data.warm_rows + 2 * data.frame_rows) & (steps < len(data.time) - 2 * data.frame_rows)]
-    for first in rng.choice(inside, 5, replace=False):
+    ends = data.frames[0][0] + data.frame_rows * np.array([1, data.frames[0][1]])
+    sizes, expected = [], []
+    for first in steps[(steps > ends[0]) & (steps < ends[1] - 100)]:
         lasts = int(rng.integers(3, 25))
         held = h.copy()
         held.lost = ((int(first), int(first) + lasts),)
         change = held.response() - h.predicted
         pulse = h["K_L"] * (data.command[first - 1] - data.command[first : first + lasts])
-        size = float(pulse @ toeplitz(information[:lasts]) @ pulse)
-        # bands are flat only on average, and the plant's grid reads delays linearly between its points
-        assert size == pytest.approx(_inner(h, change, change), rel=0.06)
-        # the slope of log L along the response, in units of its own noise sqrt(size)
+        sizes.append(float(pulse @ toeplitz(information[:lasts]) @ pulse))
+        expected.append(_inner(h, change, change))
+        # log L along the response is off by less than a twentieth of the noise that it has anyhow
         slope = float(pulse @ score[first : first + lasts])
-        assert abs(slope - _inner(h, change, h.residual)) < 0.15 * np.sqrt(size)
+        assert abs(slope - _inner(h, change, h.residual)) < 0.05 * np.sqrt(expected[-1])
+    # A frame's lowest coefficients depend on where in it a pulse lies, by some 25 % of a pulse's size where they weigh
+    # most; the information is the mean over places, here of some 40, and its bands have edges: 5 % of standard error.
+    assert sum(sizes) == pytest.approx(sum(expected), rel=0.25)
 
 
-def test_scores_of_many_columns_are_those_of_each(rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_scores_of_many_columns_are_those_of_each(fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     h = _hypothesis(rng)
     columns = rng.normal(size=(3, *h.residual.shape))
     together = demand_score(h, h.covariance, columns)
@@ -83,8 +86,8 @@ def test_scores_of_many_columns_are_those_of_each(rotating_seed: int) -> None:
     np.testing.assert_allclose(gradient, [_inner(h, a, h.residual) for a in columns], rtol=1e-7)
 
 
-def test_take_out_is_the_product_with_the_information(rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_take_out_is_the_product_with_the_information(fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     n, first = 40, 33
     information, cover, pulse = rng.normal(size=9), rng.random(n), rng.normal(size=5)
     score = rng.normal(size=n)
@@ -106,5 +109,5 @@ def test_frames_see_the_middle_and_no_end_of_a_stretch() -> None:
     np.testing.assert_allclose(cover[first + M : first + count * M], 1.0)
     assert cover[: first - 100].max() == 0.0
     # what begins before the frames and lasts into them is seen by a little of their first window
-    assert 0.0 < cover[first - 5] < 0.3
+    assert 0.0 < cover[first - 5] < np.sin(0.5 * np.pi * 3 * h["T_L"] / (M * DT)) + 1e-9
     assert ((cover >= 0.0) & (cover <= 1.0)).all()

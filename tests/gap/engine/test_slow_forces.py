@@ -27,7 +27,7 @@ from avtorch.gap.engine.slow_forces import (
     wishart_log_likelihood,
     wishart_profile,
 )
-from tests.bars import BAR, log_odds
+from tests.bars import BAR, log_odds, student
 
 RATE_HZ = 20
 SPEED_MPS = 15.0
@@ -99,7 +99,7 @@ def test_the_response_is_the_mean_square_of_coefficients(rotating_seed: int, dra
     expected = response.energy @ gust_spectrum(response.frequency, 2.0)
     error = np.std(each, axis=0, ddof=1) / np.sqrt(repeats)
     # rows in place of continuous time: a spectrum that is repeated at the rate of the rows, seen below 2 of 20 Hz
-    assert (np.abs(np.mean(each, axis=0) / expected - 1) < BAR * error / expected + 0.04).all()
+    assert (np.abs(np.mean(each, axis=0) / expected - 1) < student(repeats - 1) * error / expected + 0.04).all()
 
 
 # the likelihood of a common power -------------------------------------------------------------------------------------

@@ -1,0 +1,271 @@
+"""Which changes explain how two sets of drives differ: a search among them, and the average of all visited sets.
+
+From one car on, the promise of each change is computed to first order; the best are fitted and valued, and the best of
+them stays while it gains. Evidence counts as everywhere: tempered, against the prior odds of one more effect. Here its
+temper is at most what the drives themselves allow, the variance by the likelihood over that by blocks and halves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from avtorch.arrays import FloatArray
+from avtorch.gap.engine.coordinates import EFFECTS
+from avtorch.gap.engine.joint import (
+    NO_CHANGE,
+    Change,
+    JointFit,
+    JointModel,
+    gram,
+    noise_left,
+    of_car,
+    of_effect,
+    products,
+)
+from avtorch.gap.engine.likelihood import claimed, log_sum
+from avtorch.gap.engine.priors import EFFECT_NATS, TEMPER, UNKNOWN_NATS
+
+Progress = Callable[[str, int, int], None]
+
+MOST = 3
+"""Changes at once."""
+_FITTED = 6  # effects besides lag, gain and dead time
+_STARTS = 2  # of an effect
+_HELD = 0.9  # probability that an alias set holds
+_CREEPS_BELOW = 3.0  # [m/s]
+_SIZES = (0.03, 0.1, 0.35)  # of free forms that one side alone has
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """How far a change's main coordinate is known: variances by the likelihood, by blocks, and of drift."""
+
+    likelihood: float
+    blocks: float
+    drift: float
+
+    @property
+    def variance(self) -> float:
+        return max(self.likelihood, self.blocks) + self.drift
+
+    @property
+    def temper(self) -> float:
+        return min(TEMPER, self.likelihood / self.variance)
+
+
+@dataclass(frozen=True, eq=False)
+class Visited:
+    """A set of changes: its fit and `log_weight`, tempered, relative to one car."""
+
+    fit: JointFit
+    log_weight: float
+
+
+@dataclass(frozen=True, eq=False)
+class ChangePosterior:
+    """`steps`: sets from one car on, each with one change more than the last; `visited` all of them.
+
+    `best`: the last set. `scatter` of each change in it. `siblings`: what else was tried where a change entered, with
+    probabilities among them. `rejected`: the strongest change of the last step, which did not enter, with its scatter.
+    `unknown`: probability that free forms differ besides.
+    """
+
+    model: JointModel
+    best: Visited
+    visited: Mapping[frozenset[tuple[str, bool]], Visited]
+    scatter: Mapping[Change, Scatter]
+    siblings: Mapping[tuple[str, bool], tuple[str, ...]]
+    rejected: tuple[JointFit, Scatter, float] | None
+    unknown: float
+
+    def probability(self, change: Change) -> float:
+        """Of a change, over all visited sets."""
+        return self._share(lambda key: change.key in key)
+
+    def _share(self, holds: Callable[[frozenset[tuple[str, bool]]], bool]) -> float:
+        whole = log_sum([v.log_weight for v in self.visited.values()])
+        own = [v.log_weight for key, v in self.visited.items() if holds(key)]
+        return math.exp(log_sum(own) - whole) if own else 0.0
+
+
+def candidates(model: JointModel, effects: Collection[str]) -> list[Change]:
+    """T_L, K_L, the dead time, and of `effects` those that a car may gain or lose."""
+    car = ["T_L", "K_L"] + ["dead_time"] * ("dead_time" in model.base.effects)
+    out = [of_car(name) for name in car]
+    held = {c.name for c in out} | set(model.own_effects)
+    data = model.whole
+    for e in EFFECTS.values():
+        if (e.name not in effects and e.base not in effects) or e.name in NO_CHANGE or e.onset == "must":
+            continue
+        if e.base in held or not e.needs <= set(data.channels):
+            continue
+        if e.name == "low_speed_creep" and (data.smooth_speed < _CREEPS_BELOW).mean() < 0.01:
+            continue
+        starts = e.starts or _limits(model)
+        out.append(of_effect(e, starts, less=False))
+        if e.one_sided:
+            out.append(of_effect(e, starts, less=True))
+    return out
+
+
+def search_changes(model: JointModel, changes: list[Change], progress: Progress | None = None) -> ChangePosterior:
+    """The posterior over sets of `changes`."""
+    now = Visited(model.start, 0.0)
+    visited = {frozenset[tuple[str, bool]](): now}
+    siblings: dict[tuple[str, bool], tuple[str, ...]] = {}
+    rejected = None
+    for number in range(1, MOST + 1):
+        tried = []
+        wanted = _promising(model, now.fit, [c for c in changes if c.name not in now.fit.names])
+        for done, change in enumerate(wanted):
+            if progress is not None:
+                progress(f"change {number}: {change.name}", done, len(wanted))
+            tried.append(model.with_change(now.fit, change))
+        if not tried:
+            break
+        found = max(tried, key=lambda f: f.evidence)
+        scatter = scatter_of(model, found, found.changes[-1])
+        each = [Visited(f, _weight(now, f, scatter.temper)) for f in tried]
+        for v in each:
+            visited[_key(v.fit)] = v
+        best = max(each, key=lambda v: v.log_weight)
+        chosen = _alike(each)
+        if best.log_weight < now.log_weight:
+            rejected = found, scatter, found.evidence - now.fit.evidence
+            break
+        siblings[best.fit.changes[-1].key] = chosen
+        now = best
+        for change in now.fit.changes[:-1]:
+            rest = model.without(now.fit, change)
+            other = Visited(rest, now.log_weight + scatter.temper * (rest.evidence - now.fit.evidence + EFFECT_NATS))
+            if _key(rest) not in visited:
+                visited[_key(rest)] = other
+            if other.log_weight > now.log_weight:
+                now = other
+    scatters = {c: scatter_of(model, now.fit, c) for c in now.fit.changes}
+    return ChangePosterior(model, now, visited, scatters, siblings, rejected, _unknown(model, now.fit))
+
+
+def scatter_of(model: JointModel, fit: JointFit, change: Change) -> Scatter:
+    """Of a change's largest coordinate in a fit."""
+    likelihood, blocks, drift = model.covariance(fit)
+    at = max(fit.at(change), key=lambda k: abs(fit.x[k]) / math.sqrt(likelihood[k, k]))
+    return Scatter(float(likelihood[at, at]), float(blocks[at, at]), float(drift[at]))
+
+
+# inside ---------------------------------------------------------------------------------------------------------------
+def _key(fit: JointFit) -> frozenset[tuple[str, bool]]:
+    return frozenset(c.key for c in fit.changes)
+
+
+def _weight(now: Visited, fit: JointFit, temper: float) -> float:
+    return now.log_weight + temper * (fit.evidence - now.fit.evidence) - TEMPER * EFFECT_NATS
+
+
+def _alike(each: list[Visited]) -> tuple[str, ...]:
+    """Names that hold nine tenths of the probability of what was tried, the most probable first."""
+    whole, held = log_sum([v.log_weight for v in each]), 0.0
+    names: list[str] = []
+    for v in sorted(each, key=lambda v: -v.log_weight):
+        names.append(v.fit.names[-1])
+        held += math.exp(v.log_weight - whole)
+        if held > _HELD:
+            break
+    return tuple(dict.fromkeys(names))
+
+
+def _limits(model: JointModel) -> tuple[tuple[float, float], ...]:
+    """Starts of both limits of a saturation, from the largest commands (inverse, [s²/m])."""
+    u = model.base["K_L"] * model.whole.command
+    high, low = max(float(np.percentile(u, 99.9)), 0.05), min(float(np.percentile(u, 0.1)), -0.05)
+    return tuple((1 / (high * f), 1 / (-low * g)) for f, g in ((0.7, 1.3), (0.4, 1.3), (1.3, 0.7), (1.3, 0.4)))
+
+
+def _promising(model: JointModel, fit: JointFit, changes: list[Change]) -> list[Change]:
+    """Those of the car, and the effects that promise most to first order, with their best starts."""
+    found: list[tuple[float, Change, tuple[float, ...]]] = []
+    for after in (False, True):
+        own = [(c, s) for c in changes if c.effect and c.less != after for s in c.starts]
+        if not own:
+            continue
+        h, noise = fit.sides[after], fit.noise[after]
+        signals = []
+        for change, start in own:
+            both = (*fit.changes, change)
+            x = np.concatenate([fit.x, start])
+            moved = model.hypothesis(both, model.coordinates(both), x, after)
+            signals.append(moved.response() - h.predicted)
+        tried = np.array(signals)
+        base = np.concatenate([fit.derivatives[after], model.columns[after]])
+        shared = gram(noise, products(h.data, base, tried))
+        gains = gram(noise, products(h.data, model.left(fit, h)[None], tried))[0]
+        sizes = np.array([gram(noise, products(h.data, x[None], x[None]))[0, 0] for x in tried])
+        sizes = sizes - np.einsum("ij,ij->j", shared, np.linalg.solve(fit.information, shared))
+        for (change, start), gain, size in zip(own, gains, np.maximum(sizes, 0.0), strict=True):
+            if gain <= 0 and EFFECTS[change.effect].one_sided:
+                continue
+            if len(start) == 1:
+                scale = float(np.clip(abs(gain) / (size + 1e-9), 0.2, 4.0)) * math.copysign(1, gain)
+                start = (start[0] * scale,)
+            found.append((0.5 * float(gain) ** 2 / (float(size) + 1), change, start))
+    found.sort(key=lambda x: -x[0])
+    starts: dict[Change, list[tuple[float, ...]]] = {}
+    for _, change, start in found:
+        if len(starts) < _FITTED or change in starts:
+            starts.setdefault(change, []).append(start)
+    best = [replace(c, starts=tuple(s[:_STARTS])) for c, s in starts.items()]
+    return [c for c in changes if not c.effect] + best
+
+
+def _unknown(model: JointModel, fit: JointFit) -> float:
+    """Probability that the free forms differ between the sides, beyond what they do between halves of one side.
+
+    Halves are a negative control: what has as much evidence within one side is no change.
+    """
+    halves = []
+    for data in model.sides:
+        second = np.zeros(data.frame_count)
+        second[data.frame_count // 2 :] = 1.0
+        halves.append(second)
+    none = [np.zeros(len(x)) for x in halves]
+    after = _own_forms(model, fit, [none[0], np.ones(len(halves[1]))])
+    within = max(_own_forms(model, fit, [halves[0], none[1]]), _own_forms(model, fit, [none[0], halves[1]]), 0.0)
+    odds = TEMPER * (after - within - UNKNOWN_NATS)
+    return 1 / (1 + math.exp(-min(max(odds, -50.0), 50.0)))
+
+
+def _own_forms(model: JointModel, fit: JointFit, acting: list[FloatArray]) -> float:
+    """Gain [nats] of free forms with coefficients of their own in the frames `acting` (frame,) of each side."""
+    count = len(fit.c)
+    bases = [np.concatenate([j, c]) for j, c in zip(fit.derivatives, model.columns, strict=True)]
+    own = [c * a[:, None] for c, a in zip(model.columns, acting, strict=True)]
+    signals = [
+        np.concatenate([model.left(fit, h)[None], base, x]) for h, base, x in zip(fit.sides, bases, own, strict=True)
+    ]
+    P = [products(h.data, x, x) for h, x in zip(fit.sides, signals, strict=True)]
+    n = len(fit.information)
+    precision = fit.information - sum(
+        gram(noise, p[..., 1 : n + 1, 1 : n + 1]) for noise, p in zip(fit.noise, P, strict=True)
+    )
+    best = -math.inf
+    for sd in _SIZES:
+        noise = list(fit.noise)
+        prior = np.zeros((n + count, n + count))
+        prior[:n, :n] = precision
+        prior[n:, n:] = sd**-2 * np.eye(count)
+        for _ in range(3):
+            total = sum(gram(s, p) for s, p in zip(noise, P, strict=True))
+            assert isinstance(total, np.ndarray)
+            H = total[1:, 1:] + prior
+            b = np.linalg.solve(H, total[1:, 0])
+            left = np.append(1.0, -b)
+            noise = [noise_left(p, left, h.data) for p, h in zip(P, fit.sides, strict=True)]
+        low = sum(claimed(h.data, s) for h, s in zip(fit.sides, noise, strict=True)) - fit.claimed
+        whole = sum(claimed(h.data, s, math.inf) for h, s in zip(fit.sides, noise, strict=True)) - fit.log_likelihood
+        occam = -count * math.log(sd) - 0.5 * float(np.linalg.slogdet(H)[1] - np.linalg.slogdet(fit.information)[1])
+        best = max(best, min(low, whole) - 0.5 * float(b @ prior @ b) + occam)
+    return best - math.log(len(_SIZES))

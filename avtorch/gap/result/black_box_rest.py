@@ -1,0 +1,232 @@
+"""What a black box still foretells of held-out blocks: a bound on what any model could.
+
+    r = X beta + n,     beta ~ N(0, sd^2),     X: what forces that commands, speed and time could make do to all channels
+
+r is what a hypothesis leaves, in lapped coefficients; the noise's covariance is free in every band and estimated anew,
+as everywhere. Columns look back only, over the whole band: in a closed loop a command answers the noise of the moment,
+and the cross terms cancel over all frequencies (Ljung 1999, 13.4). A regression of the errors of free runs themselves
+would foretell noise from its echo. A force shows in both channels, a fault of the accelerometer in its own alone.
+
+Columns are of size one and stand in three sets, each with those before it. Sets and prior sizes are averaged by their
+evidence from the taught blocks, so the regression vanishes where there is no structure (MacKay 1992). What it could
+have missed is the spread of its posterior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from avtorch.arrays import FloatArray, IntArray
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.free_forms import band_products
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.result.free_runs import Blocks, compared, readings
+
+_LAGS_S = (0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
+_SMOOTH_S = 0.5  # of the speed: little of the noise of the moment is in it
+_LINEAR, _MAP, _TIME = range(3)  # sets of columns, each with those before it
+_PRIOR_SD = np.geomspace(0.001, 3.0, 12)  # of a coefficient [m/s²]
+_STEPS = 4  # alternations between coefficients and noise
+_DRAWS = 200  # of the posterior
+_LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
+
+
+class Predicted(NamedTuple):
+    """By the fit without each fold: `readings` (fold, channel, row), `coefficients` (fold, channel, frame, bin), and
+    `possible` (draw, channel, block): draws of the squares of free runs of what may be there."""
+
+    readings: FloatArray
+    coefficients: FloatArray
+    possible: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class BlackBox:
+    """Columns beside a hypothesis: `forces`, then `faults` (column, row), each of a set `kind` (column,), and the
+    `readings` (column, channel, row) and `coefficients` (column, channel, frame, bin) that they make."""
+
+    hypothesis: Hypothesis
+    forces: FloatArray = field(repr=False)
+    faults: FloatArray = field(repr=False)
+    kind: IntArray = field(repr=False)
+    readings: FloatArray = field(repr=False)
+    coefficients: FloatArray = field(repr=False)
+
+    @classmethod
+    def of(cls, h: Hypothesis) -> BlackBox:
+        """The columns that commands, speed, time and the hypothesis's own response make."""
+        signals = _signals(h)
+        forces, kind = _forces(h.data, signals)
+        faults = forces[:0]
+        if h.data.channel_count == 2:
+            faults, own = _faults(signals)
+            kind = np.concatenate([kind, own])
+        shown = np.stack([_shown(h, x) for x in forces] + [_shown(h, None, x) for x in faults])
+        return cls(h, forces, faults, kind, shown, np.stack([h.data.transform(compared(h.data, x)) for x in shown]))
+
+    def predict(self, residuals: FloatArray, blocks: Blocks) -> Predicted:
+        """What the columns foretell of each fold's blocks, taught by the `residuals` (fold, channel, frame, bin) of the
+        other blocks alone."""
+        h, X = self.hypothesis, self.coefficients
+        rng = np.random.default_rng(0)
+        normal, uniform = rng.standard_normal((_DRAWS, len(X))), rng.random(_DRAWS)
+        runs = blocks.free_runs(h.data, self.readings)
+        alike = [(blocks.taught == pattern[:, None]).all(0) for pattern in np.unique(blocks.taught, axis=1).T]
+        products = [band_products(h.data, X[:, :, frames]) for frames in alike]
+        rows, coefficients = [], []
+        possible = np.zeros((_DRAWS, h.data.channel_count, len(blocks.rows)))
+        for k, frames in enumerate(blocks.taught):
+            own = np.sum([x for x, group in zip(products, alike, strict=True) if frames[group].all()], axis=0)
+            taught = _Taught.of(h.data.only(frames), own, X[:, :, frames], residuals[k][:, frames])
+            mean, draws = taught.posterior(self.kind, normal, uniform)
+            split = len(self.forces)
+            rows.append(_shown(h, mean[:split] @ self.forces, mean[split:] @ self.faults))
+            coefficients.append(h.data.transform(compared(h.data, rows[-1])))
+            for b in np.flatnonzero(blocks.fold == k):
+                for c in range(runs.shape[1]):
+                    part = runs[:, c, blocks.rows[b]]
+                    possible[:, c, b] = ((draws @ (part @ part.T)) * draws).sum(1)
+        return Predicted(np.stack(rows), np.stack(coefficients), possible)
+
+
+class _Taught(NamedTuple):
+    """Products over taught frames, in each band: of columns (band, channel, channel, column, column), of columns and
+    residual (band, channel, channel, column), of the residual (band, channel, channel)."""
+
+    data: DriveData
+    columns: FloatArray
+    mixed: FloatArray
+    residual: FloatArray
+
+    @classmethod
+    def of(cls, data: DriveData, columns: FloatArray, X: FloatArray, residual: FloatArray) -> _Taught:
+        edges = data.band_edges[:-1]
+        mixed = np.einsum("pcfk,dfk->cdpk", X, residual, optimize=True)
+        squares = np.einsum("cfk,dfk->cdk", residual, residual)
+        return cls(
+            data,
+            columns,
+            np.moveaxis(np.add.reduceat(mixed, edges, axis=-1), -1, 0),
+            np.moveaxis(np.add.reduceat(squares, edges, axis=-1), -1, 0),
+        )
+
+    def posterior(self, kind: IntArray, normal: FloatArray, uniform: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean (column,) and draws (draw, column) of the coefficients, from standard normal (draw, column) and uniform
+        (draw,) numbers."""
+        variance = _PRIOR_SD**2
+        mean = np.zeros(len(kind))
+        for _ in range(_STEPS):
+            weights = np.linalg.inv(self._noise(mean))
+            gram, match = np.tensordot(weights, self.columns, 3), np.tensordot(weights, self.mixed, 3)
+            axes, logs, means = [], [], []
+            for last in (_LINEAR, _MAP, _TIME):
+                use = kind <= last
+                values, vectors = np.linalg.eigh(gram[np.ix_(use, use)])
+                own = vectors.T @ match[use]
+                taken = variance[:, None] / (1 + variance[:, None] * np.maximum(values, 0.0))  # posterior variances
+                logs.append(0.5 * (own**2 * taken + np.log(taken / variance[:, None])).sum(1))
+                whole = np.zeros((len(kind), len(values)))
+                whole[use] = vectors
+                axes.append((whole, taken))
+                means.append((own * taken) @ whole.T)
+            log = np.concatenate(logs)
+            chance = np.exp(log - np.logaddexp.reduce(log))
+            mean = chance @ np.concatenate(means)
+        drawn = np.minimum(np.searchsorted(np.cumsum(chance), uniform), len(chance) - 1)
+        draws = np.concatenate(means)[drawn]
+        for i, at in enumerate(drawn):
+            whole, taken = axes[at // len(variance)]
+            draws[i] += whole @ (np.sqrt(taken[at % len(variance)]) * normal[i, : whole.shape[1]])
+        return mean, draws
+
+    def _noise(self, mean: FloatArray) -> FloatArray:
+        """Covariance (band, channel, channel) of what coefficients (column,) leave."""
+        mixed = self.mixed @ mean
+        S = self.residual - mixed - mixed.transpose(0, 2, 1) + (self.columns @ mean) @ mean
+        S = S / self.data.band_size[:, None, None]
+        return S + _LEAST * np.trace(S, axis1=1, axis2=2)[:, None, None] * np.eye(S.shape[1])
+
+
+# what is shown -------------------------------------------------------------------------------------------------------
+def _shown(h: Hypothesis, force: FloatArray | None, fault: FloatArray | None = None) -> FloatArray:
+    """Readings (channel, row) that a force (row,) and a fault of the accelerometer (row,) [m/s²] make."""
+    if force is None:
+        out = np.zeros((h.data.channel_count, len(h.data.time)))
+    else:
+        grid = h.data.grid
+        step = np.where(grid.starts, 0.0, np.diff(grid.time, prepend=grid.time[:1]))
+        acts = force[grid.row]
+        out = readings(h, acts, np.cumsum(step * np.concatenate([acts[:1], acts[:-1]])))
+    if fault is not None and h.data.accel is not None:
+        out[0] += fault
+    return out
+
+
+# columns -------------------------------------------------------------------------------------------------------------
+class _Signals(NamedTuple):
+    """Of rows, in units of their spread: command (in that of `a`), the body's acceleration and its slopes, the speed
+    (centred); time runs from -1 to 1."""
+
+    u: FloatArray
+    a: FloatArray
+    jerk: FloatArray
+    snap: FloatArray
+    v: FloatArray
+    t: FloatArray
+
+
+def _signals(h: Hypothesis) -> _Signals:
+    data = h.data
+    gained = h.on_grid()[1][np.searchsorted(data.grid.row, np.arange(len(data.time)))]
+
+    def back(x: FloatArray) -> FloatArray:
+        """Slope over the row before."""
+        out = np.diff(x, prepend=x[:1]) / np.diff(data.time, prepend=data.time[0] - data.dt)
+        out[data.starts] = 0.0
+        return out
+
+    a = back(gained)
+    jerk = data.low_pass(back(a), 0.1)
+    snap = data.low_pass(back(jerk), 0.1)
+    u = np.where(data.starts, data.command, np.roll(data.command, 1))
+    v = data.low_pass(data.smooth_speed, _SMOOTH_S)
+    t = 2 * (data.time - data.time.mean()) / max(float(np.ptp(data.time)), 1e-9)
+    spread = max(float(a.std()), 1e-3)
+    return _Signals(u / spread, a / spread, _unit(jerk), _unit(snap), (v - v.mean()) / max(float(v.std()), 0.1), t)
+
+
+def _unit(x: FloatArray) -> FloatArray:
+    return x / max(float(x.std()), 1e-9)
+
+
+def _forces(data: DriveData, signals: _Signals) -> tuple[FloatArray, IntArray]:
+    """Forces (column, row), each of size about one, and the set (column,) of each."""
+    u, a, jerk, snap, v, t = signals
+    lp = data.low_pass
+    linear = [np.ones_like(a), u, a, jerk, snap, *(lp(u, lag) for lag in _LAGS_S)]
+    one_sided = [np.minimum(a, 0.0), np.where(a < 0, jerk, 0.0), *(lp(np.minimum(u, 0.0), lag) for lag in (0.2, 0.8))]
+    play = [np.tanh(4 * a), np.tanh(jerk), lp(np.tanh(4 * jerk), 0.3)]
+    speed = [*_hats(v, 5), *(a * x for x in _hats(v, 5)), jerk * v]
+    time = [t, t**2, a * t, a * t**2, a * t**3]
+    return _of_sets(linear, [*one_sided, *play, *_hats(a, 9), *speed], time)
+
+
+def _faults(signals: _Signals) -> tuple[FloatArray, IntArray]:
+    """Errors of the accelerometer (column, row), and the set (column,) of each."""
+    _, a, jerk, snap, v, t = signals
+    nonlinear = [np.minimum(a, 0.0), *_hats(v, 3), a * v, np.tanh(jerk)]
+    return _of_sets([np.ones_like(a), a, jerk, snap], nonlinear, [t, a * t])
+
+
+def _hats(x: FloatArray, count: int) -> list[FloatArray]:
+    """Linear splines (row,) that sum to one, on equidistant knots over the range of `x`: nothing extrapolates."""
+    at = (count - 1) * (x - x.min()) / max(float(np.ptp(x)), 1e-9)
+    return [np.maximum(1 - np.abs(at - k), 0.0) for k in range(count)]
+
+
+def _of_sets(*sets: Sequence[FloatArray]) -> tuple[FloatArray, IntArray]:
+    return np.array([x for one in sets for x in one]), np.repeat(np.arange(len(sets)), [len(one) for one in sets])

@@ -1,0 +1,265 @@
+"""Nested hypotheses on held-out blocks: errors of free runs, and log densities, by fits to the other blocks alone.
+
+The fits of the folds begin at the fit to all blocks and share its Jacobian (Gauss-Newton with a fixed slope, the chord
+method), so a fold costs three simulations. The predictive density of a held-out frame has the noise's covariance
+integrated out, as the likelihood has: with n coefficients a channel, of products A, taught in a band, and m, of products
+B, held out,
+
+    log p(B | A) = n/2 log det A - (n + m)/2 log det (A + B) + log Gamma_C((n + m)/2) - log Gamma_C(n/2) - m C/2 log pi
+
+(matrix Student; Gelman et al. 2013, 3.6). No free run foretells which messages are lost, so all have arrived.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from scipy.special import multigammaln
+
+from avtorch.arrays import BoolArray, FloatArray
+from avtorch.gap.answer.budget import HORIZON_S
+from avtorch.gap.engine.coordinates import INDEX, base_name
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.gauss_newton import fit, jacobian, penalty, prior_terms
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.likelihood import band_covariance, whiten
+from avtorch.gap.result.black_box_rest import BlackBox
+from avtorch.gap.result.free_runs import Blocks, compared, measured_readings, readings
+
+_STEPS = 3  # of a fold's fit
+_DAMPED = (1.0, 0.3, 0.1)  # of a step that loses
+_RANDOM = "command_hold"  # the one effect of a plant that chance decides
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Of one model: sums of squared errors of free runs (channel, block) [(m/s²)², (m/s)²], and of log densities
+    (block,) [nats]."""
+
+    squares: FloatArray
+    nats: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """A chain of nested hypotheses on blocks that taught neither their parameters nor their noise.
+
+    `steps`: scores of each hypothesis of `chain`; `floor`, `ceiling`: of the last and the first with a black box on top
+    (`black_box_rest`). `values` (hypothesis, fold, parameter): as each fold's other blocks teach them. `errors`,
+    `predicted` (channel, row) [m/s²]: of acceleration and differenced speed, what the last hypothesis leaves and what
+    the black box foretells of it. `horizon_s` of the free runs.
+    """
+
+    chain: tuple[Hypothesis, ...]
+    blocks: Blocks
+    steps: tuple[Scores, ...]
+    floor: Scores
+    ceiling: Scores
+    values: FloatArray = field(repr=False)
+    errors: FloatArray = field(repr=False)
+    predicted: FloatArray = field(repr=False)
+    possible: FloatArray = field(repr=False)
+    horizon_s: float
+
+    @property
+    def data(self) -> DriveData:
+        return self.chain[-1].data
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The effects by the table's names, in the order in which they enter."""
+        return tuple(entered(a, b) for a, b in pairwise(self.chain))
+
+    @property
+    def frame_rows(self) -> FloatArray:
+        """Rows (block,) that the densities are of: one hop a frame."""
+        return np.bincount(self.blocks.block_of_frame, minlength=len(self.blocks.rows)) * float(self.data.frame_rows)
+
+
+def held_out_errors(chain: Sequence[Hypothesis]) -> HeldOut | None:
+    """The scores of nested hypotheses, fitted to all blocks, the base first (`nested`).
+
+    None where the drives are too short for `FEWEST` blocks.
+
+    Example:
+        >>> from avtorch import Leader, simulate
+        >>> from avtorch.gap import ConstantResistance, plant
+        >>> from avtorch.gap.engine.drive_data import DriveData
+        >>> from avtorch.gap.engine.gauss_newton import fit
+        >>> from avtorch.gap.engine.recorder import base_fit
+        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.05)
+        >>> log = simulate(Leader.default(start=30.0, duration=120.0, dt=0.05), plant=dragging).log()
+        >>> base = base_fit(DriveData.of(log))
+        >>> held = held_out_errors([base, fit(base.with_effect("constant_resistance", (0.1,)))])
+        >>> before, after = (step.squares.sum(-1) for step in held.steps)
+        >>> held.names, bool((after < 0.5 * before).all())
+        (('constant_resistance',), True)
+    """
+    data = chain[-1].data
+    blocks = Blocks.of(data)
+    if blocks is None:
+        return None
+    fitted = [_taught(h, blocks) for h in chain]
+    stitched = [blocks.stitched(x.errors) for x in fitted]
+    scored = [_scores(data, blocks, e, x.residuals, x.residuals) for x, e in zip(fitted, stitched, strict=True)]
+    beside, foretold, possible = [], [], []
+    for x, errors in ((fitted[-1], stitched[-1]), (fitted[0], stitched[0])):
+        found = BlackBox.of(x.hypothesis).predict(x.residuals, blocks)
+        possible.append(found.possible)
+        foretold.append(blocks.stitched(found.readings))
+        beside.append(_scores(data, blocks, errors - foretold[-1], x.residuals, x.residuals - found.coefficients))
+    longest = max(rows.stop - rows.start for rows in blocks.rows) * data.dt
+    return HeldOut(
+        chain=tuple(chain),
+        blocks=blocks,
+        steps=tuple(scored),
+        floor=beside[0],
+        ceiling=beside[1],
+        values=np.stack([x.values for x in fitted]),
+        errors=np.stack(compared(data, stitched[-1])),
+        predicted=np.stack(compared(data, foretold[0])),
+        possible=possible[0],
+        horizon_s=min(HORIZON_S, longest),
+    )
+
+
+def nested(base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis] = ()) -> list[Hypothesis]:
+    """A chain from `base` to `full`, one more effect at a time, those without which free runs are worst first.
+
+    From `full` on the effect leaves that free runs miss least, all others refitted; fits among `visited` are taken as
+    they are. What chance decides enters with the first effect. Runs are those of the fit: the order is no score.
+    """
+    known = {_key(h): h for h in visited}
+    floor = _run_squares(full)
+    chain = [full]
+    while len(_sized(chain[-1])) > 1:
+        now = chain[-1]
+        rest = {e: known.get(_key(now, e)) or _refitted(now, e) for e in _sized(now)}
+        cost = {e: float((_run_squares(h) / floor).mean()) for e, h in rest.items()}
+        chain.append(rest[min(cost, key=lambda e: cost[e])])
+    return [base, *(reversed(chain) if _sized(full) else ())]
+
+
+def entered(before: Hypothesis, after: Hypothesis) -> str:
+    """The effect, by the table's name, that one hypothesis has and the one before it has not."""
+    return next(base_name(e) for e in _sized(after) if e not in before.effects)
+
+
+# fits ------------------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class _Taught:
+    """A hypothesis fitted without each fold: `values` (fold, parameter), residuals of all frames (fold, channel, frame,
+    bin), and errors (fold, channel, row) of readings."""
+
+    hypothesis: Hypothesis
+    values: FloatArray
+    residuals: FloatArray
+    errors: FloatArray
+
+
+def _taught(h: Hypothesis, blocks: Blocks) -> _Taught:
+    h = _without_chance(h)
+    slopes = jacobian(h, h.free)
+    values, residuals, errors = [], [], []
+    for frames in blocks.taught:
+        fold = h.copy()
+        fold.values = _fold_fit(h, slopes, frames)
+        rows = readings(fold, *fold.on_grid())
+        values.append(fold.values)
+        residuals.append(h.data.measured - h.data.transform(compared(h.data, rows)))
+        errors.append(measured_readings(h.data) - rows)
+    return _Taught(h, np.array(values), np.array(residuals), np.array(errors))
+
+
+def _fold_fit(h: Hypothesis, slopes: FloatArray, frames: BoolArray) -> FloatArray:
+    """Values (parameter,) fitted to some `frames`, `slopes` (free, channel, frame, bin) being those of the whole fit.
+
+    What stands at a limit stays there.
+    """
+    names = h.free
+    low, high = np.array([h.limits(n) for n in names]).T
+    at = np.array([INDEX[n] for n in names])
+    moves = (h.values[at] > low) & (h.values[at] < high)
+    names, at, low, high = [n for n, m in zip(names, moves, strict=True) if m], at[moves], low[moves], high[moves]
+    slopes = slopes[moves][:, :, frames]
+    now = h.on(h.data.only(frames))
+    for _ in range(_STEPS):
+        W = np.array([whiten(now.data, now.covariance, x) for x in slopes])
+        precision, pull = prior_terms(now, names)
+        step = np.linalg.solve(
+            W @ W.T + np.diag(precision + 1e-12), W @ whiten(now.data, now.covariance, now.residual) + pull
+        )
+        value = now.log_likelihood + penalty(now, names)
+        for share in _DAMPED:
+            new = now.copy()
+            new.values[at] = np.clip(now.values[at] + share * step, low, high)
+            new.evaluate()
+            if new.log_likelihood + penalty(new, names) > value:
+                now = new
+                break
+        else:
+            break
+    return now.values
+
+
+def _without_chance(h: Hypothesis) -> Hypothesis:
+    """The hypothesis with all messages arrived, evaluated."""
+    if not h.lost:
+        return h
+    other = h.copy()
+    other.lost = ()
+    return other.evaluate()
+
+
+def _sized(h: Hypothesis) -> list[str]:
+    """Effects that a free run shows."""
+    return [e for e in h.effects if e != _RANDOM]
+
+
+def _key(h: Hypothesis, without: str | None = None) -> frozenset[tuple[str, bool]]:
+    return frozenset((e, e in h.onsets) for e in h.effects if e != without)
+
+
+def _refitted(h: Hypothesis, without: str) -> Hypothesis:
+    rest = h.without(without)
+    if without == "dead_time":  # what was a delay is a lag now
+        rest["T_L"] += 0.8 * h["dead_time"]
+    return fit(rest, 6, 0.1)
+
+
+# scores --------------------------------------------------------------------------------------------------------------
+def _run_squares(h: Hypothesis) -> FloatArray:
+    """Mean squared errors (channel,) of free runs by a fit to all blocks."""
+    blocks = Blocks.of(h.data)
+    assert blocks is not None
+    h = _without_chance(h)
+    errors = measured_readings(h.data) - readings(h, *h.on_grid())
+    return blocks.sums(blocks.free_runs(h.data, errors) ** 2).sum(-1) + 1e-12
+
+
+def _scores(data: DriveData, blocks: Blocks, errors: FloatArray, taught: FloatArray, residuals: FloatArray) -> Scores:
+    """Scores of `errors` (channel, row) and of `residuals` (fold, channel, frame, bin), whose noise `taught` tells."""
+    squares = blocks.sums(blocks.free_runs(data, errors) ** 2)
+    fold = blocks.fold[blocks.block_of_frame]
+    nats = np.zeros(len(fold))
+    for k, frames in enumerate(blocks.taught):
+        own = fold == k
+        nats[own] = _log_density(data.only(frames), taught[k][:, frames], residuals[k][:, own])
+    return Scores(squares, np.bincount(blocks.block_of_frame, nats, len(blocks.rows)))
+
+
+def _log_density(taught: DriveData, residual: FloatArray, held_out: FloatArray) -> FloatArray:
+    """Log densities (frame,) of `held_out` (channel, frame, bin), given the taught frames' `residual`."""
+    C, n = taught.channel_count, taught.band_size.astype(float)
+    A = band_covariance(taught, residual) * n[:, None, None]
+    A = A + 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(C)
+    products = held_out[:, None] * held_out[None]
+    B = np.moveaxis(np.add.reduceat(products, taught.band_edges[:-1], axis=-1), (0, 1), (-2, -1))
+    m = np.diff(taught.band_edges)
+    log_det, joint = np.linalg.slogdet(A)[1], np.linalg.slogdet(A + B)[1]
+    constant = multigammaln(0.5 * (n + m), C) - multigammaln(0.5 * n, C) - 0.5 * m * C * math.log(math.pi)
+    return (0.5 * n * log_det - 0.5 * (n + m) * joint + constant).sum(-1)

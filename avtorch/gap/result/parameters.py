@@ -1,0 +1,198 @@
+"""Parameters of a hypothesis under the answer's names, with uncertainty, and the repaired simulator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from avtorch.arrays import FloatArray
+from avtorch.gap.effects import Gust, Outliers, RoadGrade
+from avtorch.gap.engine.average import Weight
+from avtorch.gap.engine.car import effect_values, plant_of
+from avtorch.gap.engine.coordinates import EFFECTS, base_name
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.likelihood import whiten
+from avtorch.gap.engine.sample import Draws, sample
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.simulator.effect import EFFECTS as TABLE
+from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.plant import GapPlant, plant
+from avtorch.io.units import GRAVITY
+
+_DRAWS = 1000
+_GRID_STEP = 0.07  # standard deviation of the logarithm of what is read from a grid of sizes
+
+
+class ParameterPosterior:
+    """Draws of what a weight of the model average says: the car's coordinates, and sizes of its random causes.
+
+    `draws` of its hypothesis's coordinates; by Laplace's approximation where None.
+    """
+
+    def __init__(self, weight: Weight, draws: Draws | None = None, seed: int = 0) -> None:
+        self.weight, self.hypothesis = weight, weight.examined.hypothesis
+        self.names = () if weight.label in ("none", "unknown") else tuple(weight.label.split("+"))
+        self._given = draws
+        self._seed = seed
+
+    @cached_property
+    def draws(self) -> Draws:
+        if self._given is not None:
+            return self._given
+        return sample(self.hypothesis, chains=1, draws=_DRAWS, seed=self._seed, method="laplace")
+
+    def _column(self, name: str) -> FloatArray:
+        return self.draws[name].reshape(-1)
+
+    @property
+    def chains(self) -> dict[str, FloatArray] | None:
+        """Draws (chain, draw) by the names of `named`, `T_L` and `K_L` first; None where they are Laplace's alone."""
+        if self._given is None:
+            return None
+        shape = self._given.x.shape[:2]
+        out = {name: self._given[name] for name in ("T_L", "K_L")}
+        for e in self.effects:
+            reported = self._drawn(e).report(torch.as_tensor(self._column("T_L").copy()))
+            pair = len(self.names) > 1
+            for key, x in reported.items():
+                out[f"{base_name(e)}.{key}" if pair else key] = x.expand(shape[0] * shape[1]).numpy().reshape(shape)
+        return out
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Those of the hypothesis that the label names, as the search knows them."""
+        return tuple(e for e in self.hypothesis.effects if base_name(e) in self.names)
+
+    def moved(self) -> dict[str, Quantity]:
+        """`T_L` [s] and `K_L` [-] under this hypothesis."""
+        return {name: Quantity.of_draws(self._column(name)) for name in ("T_L", "K_L")}
+
+    def by_effect(self) -> dict[str, dict[str, Quantity]]:
+        """Parameters of each named cause, by the table's names."""
+        out = {}
+        for e in self.effects:
+            effect = self._drawn(e)
+            reported = effect.report(torch.as_tensor(self._column("T_L").copy()))
+            out[base_name(e)] = {key: Quantity.of_draws(x) for key, x in reported.items()}
+        return out | self._random()
+
+    def named(self) -> dict[str, Quantity]:
+        """The same in one mapping: of one cause by its parameters' names, of several as `effect.parameter`."""
+        each = self.by_effect()
+        if len(self.names) == 1:
+            return each.get(self.names[0], {})
+        return {f"{name}.{key}": q for name, own in each.items() for key, q in own.items()}
+
+    def belief(self, count: int = 64) -> dict[str, FloatArray]:
+        """Draws (draw,) of the repaired simulator's parameters, by its own names."""
+        every = max(1, len(self._column("T_L")) // count)
+        out = {name: self._column(name)[::every][:count] for name in ("T_L", "K_L")}
+        for e in self.effects:
+            effect = self._drawn(e)
+            for p in effect.coordinates():
+                value = getattr(effect, p.name, None)
+                if isinstance(value, torch.Tensor) and value.dim() == 1:
+                    out[f"{effect.name}.{p.name}"] = value.numpy()[::every][:count]
+        return out
+
+    def plant(self, baseline: GapPlant | None, sigma: float) -> GapPlant:
+        """The repaired simulator at the posterior mean, with its random causes. Effects act from the start of a drive,
+        even where the car has them from an onset, but for a change of the gain."""
+        mean = self.hypothesis.copy()
+        for name in mean.free:
+            mean[name] = float(self._column(name).mean())
+        mean.effects = list(self.effects)
+        car = plant_of(mean, baseline)
+        return plant(self._random_effects(), baseline=car, sigma=sigma)
+
+    # inside --------------------------------------------------------------------------------------------------------
+    def _drawn(self, e: str) -> Effect:
+        """The effect with draws (draw,) as its fields."""
+        kind = EFFECTS[e].kind or TABLE[base_name(e)]
+        given = effect_values(self.hypothesis, e)
+        for c in EFFECTS[e].coordinates:
+            given[c.parameter] = torch.as_tensor([c.value(x) for x in self._column(c.name).tolist()])
+        if e == "command_hold":
+            rows = len(self.hypothesis.data.time)
+            p, n = given["hold_fraction"], len(self.hypothesis.lost)
+            relative = 1 / math.sqrt(max(n, 1))  # stretches come one by one
+            draws = np.random.default_rng(self._seed).normal(0, relative, len(self._column("T_L")))
+            given["hold_fraction"] = torch.as_tensor(np.clip(p * np.exp(draws), 1 / rows, 0.999))
+        return kind(**{f.name: given[f.name] for f in fields(kind) if f.name in given})
+
+    def _random(self) -> dict[str, dict[str, Quantity]]:
+        """Sizes of the random causes that the label names."""
+        slow, data = self.weight.composition.slow, self.hypothesis.data
+        seconds = len(data.time) * data.dt
+        out: dict[str, dict[str, Quantity]] = {}
+        if "gust" in self.names:
+            spread = math.hypot(math.sqrt(slow.gust_time / seconds), _GRID_STEP)
+            out["gust"] = {
+                "sd_mps2": _log_normal(slow.gust_sd, spread),
+                "time_constant_s": _log_normal(slow.gust_time, math.hypot(2 * spread, 2 * _GRID_STEP)),
+            }
+        if "road_grade" in self.names:
+            way = max(float(data.position[-1] - data.position[0]), 1.0)
+            spread = math.hypot(math.sqrt(slow.road_length / way), _GRID_STEP)
+            out["road_grade"] = {"grade_rms": _log_normal(slow.road_sd / GRAVITY, spread)}
+        found = self.weight.examined.outliers
+        if "outliers" in self.names and found is not None:
+            count, rows = max(len(found.starts), 1), len(data.time)
+            errors = found.errors[found.starts] if len(found.starts) else np.ones(1)
+            noise = 1.4826 * float(np.median(np.abs(np.diff(found.errors)))) / math.sqrt(2)
+            scale = float(np.sqrt((errors**2).mean())) / max(noise, 1e-9)
+            out["outliers"] = {
+                "fraction": _log_normal(count / rows, 1 / math.sqrt(count)),
+                "scale": _log_normal(scale, 1 / math.sqrt(2 * count)),
+            }
+        return out
+
+    def _random_effects(self) -> list[Effect]:
+        sizes = {name: {key: q.mean for key, q in own.items()} for name, own in self._random().items()}
+        out: list[Effect] = []
+        if "gust" in sizes:
+            out.append(Gust(**sizes["gust"]))
+        if "outliers" in sizes:
+            found = self.weight.examined.outliers
+            assert found is not None
+            noise = 1.4826 * float(np.median(np.abs(np.diff(found.errors)))) / math.sqrt(2)
+            out.append(Outliers(**sizes["outliers"]).in_noise(noise))
+        if "road_grade" in sizes:
+            out.append(road_along(self.hypothesis, RoadGrade(sizes["road_grade"]["grade_rms"])))
+        return out
+
+
+def road_along(h: Hypothesis, road: RoadGrade) -> RoadGrade:
+    """The road with its likeliest profile: the slow force of the residual along the position, a linear regression on
+    the road's own splines under the noise of the hypothesis (a Gaussian process; Rasmussen and Williams 2006, 2.7)."""
+    data = h.data
+    position = torch.as_tensor(data.position - data.position[0])
+    prepared = road.prepared(torch.as_tensor(data.time), torch.as_tensor(data.smooth_speed), position)
+    size = float(torch.as_tensor(road.grade_rms))
+    columns = prepared.columns(position).numpy() * size
+    shown = [data.accel is not None and data.accel_kind == "kinematic", data.speed is not None]
+    channels = [x for x, there in zip(shown, (data.accel is not None, data.speed is not None), strict=True) if there]
+    white = np.array([whiten(data, h.covariance, _force(data.transform([c])[0], channels)) for c in columns.T])
+    A = white @ white.T + np.eye(len(white))
+    profile = np.linalg.solve(A, white @ whiten(data, h.covariance, h.residual))
+    return replace(prepared, profile=torch.as_tensor(profile))
+
+
+def _force(coefficients: FloatArray, channels: list[bool]) -> FloatArray:
+    return np.stack([coefficients if there else np.zeros_like(coefficients) for there in channels])
+
+
+def _log_normal(value: float, spread: float) -> Quantity:
+    return Quantity.of_logarithm(math.log(max(value, 1e-9)), spread * spread, 1.6449)
+
+
+def base_quantities(base: Hypothesis, seed: int = 0) -> tuple[dict[str, Quantity], Mapping[str, FloatArray]]:
+    """`T_L` [s] and `K_L` [-] of the base, as quantities and as draws (draw,)."""
+    found = sample(base, chains=1, draws=_DRAWS, seed=seed, method="laplace")
+    draws = {name: found[name].reshape(-1) for name in ("T_L", "K_L")}
+    return {name: Quantity.of_draws(x) for name, x in draws.items()}, {k: x[::15] for k, x in draws.items()}
