@@ -8,22 +8,22 @@ effects of the changed recording's answer are fitted. What a car has of an effec
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from avtorch.blindtest import IN_FRONT, put_in_front
 from avtorch.blindtest.in_front_score import SIZE_OF, SIZE_WITHIN
 from avtorch.errors import InputError
-from avtorch.gap import EFFECTS, Budget, gap_budget, plant
-from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.forward_selection import baseline_noise
-from avtorch.gap.budget.given_effects import given_effects
-from avtorch.gap.budget.own_noise import own_noise, with_sizes
-from avtorch.gap.budget.repaired_model import parameters_of
-from avtorch.gap.budget.robust_fit import Fit, RobustFit
+from avtorch.gap import EFFECTS, Budget, Part, gap_budget
+from avtorch.gap.engine.coordinates import EFFECTS as TRIED
+from avtorch.gap.engine.coordinates import base_name
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.gauss_newton import fit
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.parameters import table_quantities
 from avtorch.io import Log
 from benchmarks.budget_cells import causes, counted
-from benchmarks.reference_selection import selected
 
 _COLUMNS = (
     "effect",
@@ -34,7 +34,6 @@ _COLUMNS = (
     "interval holds, same effects",
     "others",
     "budget",
-    "simplest selection",
 )
 HEADER = f"| {' | '.join(_COLUMNS)} |\n{'|---' * len(_COLUMNS)}|"
 
@@ -57,7 +56,7 @@ class InFront:
 
     `named`: the verdict holds it; `alias`: it holds what these drives cannot tell from it. `size`, `same`: None where
     it is not named. `others`: names that neither the effect nor the untouched recording accounts for; `nothing`:
-    whether the verdict is `none` or `unknown`. `simple`, `simple_others`: of the simplest selection.
+    whether the verdict is `none` or `unknown`.
     """
 
     effect: str
@@ -69,16 +68,13 @@ class InFront:
     others: tuple[str, ...]
     nothing: bool
     budget: str
-    simple: tuple[str, ...]
-    simple_others: tuple[str, ...]
 
     def __str__(self) -> str:
         """Its row of the table under `HEADER`."""
         truth = ", ".join(f"{value:.3g}" for value in self.put_in.values())
         sizes = [cell for size in (self.size, self.same) for cell in _cells(size)]
         found = "named" if self.named else "alias" if self.alias else "missed"
-        others, simple = ", ".join(self.others), ", ".join(self.simple) or "none"
-        return f"| {self.effect} ({truth}) | {found} | {' | '.join(sizes)} | {others} | {self.budget} | {simple} |"
+        return f"| {self.effect} ({truth}) | {found} | {' | '.join(sizes)} | {', '.join(self.others)} | {self.budget} |"
 
 
 def _cells(size: Size | None) -> tuple[str, str]:
@@ -101,18 +97,13 @@ def closing(rows: Sequence[InFront]) -> list[str]:
         f"beside the same effects {of_all([size.right for size in same])}",
         f"intervals that hold {of_all([size.holds for size in sizes])}, "
         f"beside the same effects {of_all([size.holds for size in same])}",
-        f"the simplest selection: named {of_all([row.effect in row.simple for row in rows])}, "
-        f"with others {of_all([bool(row.simple_others) for row in rows])}",
     ]
 
 
 def in_front(log: Log, size: float) -> None:
     """Prints a row per effect that no chance decides, and the counts."""
-    control, alone = gap_budget(log), baseline_noise(AnalysisRecord.for_budget([log]), plant([]))
-    simple_control = selected([log])
-    print(
-        f"{HEADER}\n| untouched | | | | | | | {causes(control)} | {', '.join(simple_control) or 'none'} |", flush=True
-    )
+    control, alone = gap_budget(log), base_fit(DriveData.of(log))
+    print(f"{HEADER}\n| untouched | | | | | | | {causes(control)} |", flush=True)
     T_L, K_L = control.baseline["T_L"], control.baseline["K_L"]
     rows: list[InFront] = []
     for number, effect in enumerate(IN_FRONT):
@@ -125,7 +116,6 @@ def in_front(log: Log, size: float) -> None:
             continue
         before = size_of(control, effect)
         own = _beside_the_same(budget, alone, effect, changed.epoch_s)
-        simple = tuple(selected([changed]))
         rows.append(
             InFront(
                 effect,
@@ -137,8 +127,6 @@ def in_front(log: Log, size: float) -> None:
                 others=tuple(name for name in budget.names if name != effect and name not in control.names),
                 nothing=not budget.names,
                 budget=causes(budget),
-                simple=simple,
-                simple_others=tuple(name for name in simple if name != effect and name not in simple_control),
             )
         )
         print(rows[-1], flush=True)
@@ -164,17 +152,24 @@ def size_of(budget: Budget, effect: str) -> Quantity | None:
     return None if part is None else part.parameters.get(SIZE_OF[effect][0])
 
 
-def _beside_the_same(budget: Budget, alone: tuple[RobustFit, Fit], effect: str, epoch_s: float) -> float | None:
+def _beside_the_same(budget: Budget, alone: Hypothesis, effect: str, epoch_s: float) -> float | None:
     """What the untouched recording has of the effect when the effects named are fitted to it, None without a name.
 
-    `alone`: its noise and its bare baseline.
+    `alone`: its base.
     """
     if size_of(budget, effect) is None:
         return None
-    parts = [part for part in budget.parts if part.name in budget.names]
-    values = {f"{part.name}.{name}": q.mean for part in parts for name, q in part.parameters.items()}
-    onsets = {part.name: part.onset_s - epoch_s for part in parts if part.onset_s is not None}
-    kinds = [EFFECTS[part.name] for part in parts]
-    selection = given_effects(*alone, kinds, values=values, onsets=onsets)
-    selection = with_sizes(replace(selection, judging=own_noise(selection.last.fit)))
-    return parameters_of(selection, effect)[SIZE_OF[effect][0]].mean
+    h = alone
+    for part in budget.parts:
+        if part.name in budget.names and part.name in EFFECTS:
+            h = with_part(h, part, epoch_s)
+    return table_quantities(fit(h, 12), effect)[SIZE_OF[effect][0]].mean
+
+
+def with_part(h: Hypothesis, part: Part, epoch_s: float) -> Hypothesis:
+    """The hypothesis with a part of a budget, from its first start and its onset on."""
+    names = [e for e in TRIED if base_name(e) == part.name]
+    late = part.onset_s is not None
+    name = next((e for e in names if (TRIED[e].onset == "must") == late), names[0])
+    onset = part.onset_s - epoch_s if part.onset_s is not None and TRIED[name].onset != "never" else None
+    return h.with_effect(name, (TRIED[name].starts or ((0.5, 0.5),))[0], onset)

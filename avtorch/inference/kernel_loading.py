@@ -22,7 +22,7 @@ def load_kernels(module: Literal["kernels", "latent_kernels"]) -> ModuleType | U
     try:
         import numba
     except ImportError:
-        return Unavailable("numba is not installed: pip install 'avtorch[fast]'")
+        return Unavailable("numba is not installed: pip install numba")
     if numba.config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
         return Unavailable("numba does not compile here: NUMBA_DISABLE_JIT is set")
     try:

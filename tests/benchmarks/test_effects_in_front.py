@@ -68,15 +68,15 @@ def test_what_is_not_named_has_no_size() -> None:
 
 def row(effect: str, **said: Any) -> InFront:
     given: dict[str, Any] = {"put_in": {"delay_s": 0.24}, "named": False, "alias": False, "size": None, "same": None}
-    given |= {"others": (), "nothing": False, "budget": "none", "simple": (), "simple_others": ()}
+    given |= {"others": (), "nothing": False, "budget": "none"}
     return InFront(effect, **(given | said))
 
 
 def test_the_closing_lines_count_with_intervals() -> None:
     rows = [
-        row("dead_time", named=True, size=Size(1.3, False), same=Size(1.0, True), simple=("dead_time", "backlash")),
+        row("dead_time", named=True, size=Size(1.3, False), same=Size(1.0, True)),
         row("dead_band", named=True, size=Size(0.9, True), same=Size(0.8, False), others=("gust",)),
-        row("road_grade", alias=True, others=("gust",), simple=("gear_shift",), simple_others=("gear_shift",)),
+        row("road_grade", alias=True, others=("gust",)),
         row("saturation", nothing=True),
     ]
     assert closing(rows) == [
@@ -84,14 +84,13 @@ def test_the_closing_lines_count_with_intervals() -> None:
         "none or unknown 1 of 4 (6 to 64 %)",
         "sizes within 25 % 1 of 2 (12 to 88 %), beside the same effects 2 of 2 (43 to 100 %)",
         "intervals that hold 1 of 2 (12 to 88 %), beside the same effects 1 of 2 (12 to 88 %)",
-        "the simplest selection: named 1 of 4 (6 to 64 %), with others 1 of 4 (6 to 64 %)",
     ]
     assert counted(0, 0) == "0 of 0"
 
 
 def test_a_row_has_a_cell_for_each_column() -> None:
     whole = row("dead_time", named=True, size=Size(1.3, False), same=Size(1.0, True), budget="dead_time 100%: 0.3")
-    assert str(whole) == ("| dead_time (0.24) | named | 1.30 | no | 1.00 | yes |  | dead_time 100%: 0.3 | none |")
+    assert str(whole) == ("| dead_time (0.24) | named | 1.30 | no | 1.00 | yes |  | dead_time 100%: 0.3 |")
     width = HEADER.splitlines()[0].count("|")
     assert str(whole).count("|") == str(row("saturation")).count("|") == width
 

@@ -1,1 +1,0 @@
-"""The constants behind probabilities, fitted to simulated cases: see `benchmarks.fit_calibration.__main__`."""
