@@ -52,7 +52,7 @@ def test_torch_is_pinned_as_in_ci() -> None:
 def test_module_says_what_it_is(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert not text.strip() or text.lstrip().startswith(('"""', 'r"""')), "a module starts with a docstring"
-    assert len(text.splitlines()) <= 400, "a file of one idea is shorter"
+    assert len(text.splitlines()) <= 600, "a file of one idea is shorter"
 
 
 def test_no_rooms_without_a_name() -> None:

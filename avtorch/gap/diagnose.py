@@ -276,9 +276,8 @@ def _likeliest(inference: Inference) -> Weight:
 
 def _base_weight(inference: Inference) -> Weight:
     """A weight of the base alone."""
-    found = [w for w in inference.average.best.values() if not w.examined.hypothesis.effects]
-    weight = inference.average.best.get("none") or (found[0] if found else next(iter(inference.average.best.values())))
-    alone = next(x for x in inference.average.examined if not x.hypothesis.effects)
+    weight = inference.average.best.get("none") or next(iter(inference.average.best.values()))
+    alone = next(x for x in inference.average.examined if x.hypothesis is inference.base)
     return replace(weight, label="none", examined=alone, composition=alone.compositions[0], slow="none", outliers=False)
 
 

@@ -261,36 +261,29 @@ def _label(candidate: Candidate, end: str) -> str:
     return candidate.name.replace("+", f" +{gap}") if count < 3 else f"the {count} effects{gap}of the budget"
 
 
-_HORIZONS = ("0.5s", "2s", "10s", "whole")
-
-
 def shrinkage(ax: Axes, found: Diagnosis, channel: str) -> Axes:
-    """Rollout errors of a `channel` over their horizons: before, after, noise floor, and with a black box.
+    """Errors of a `channel` in held-out free runs: before, with a black box, after, and the noise floor.
 
     Raises `InputError` where nothing was held out, or not this channel.
     """
     scores = found.shrinkage
-    names = [_metric(channel, h) for h in _HORIZONS]
-    if scores is None or names[0] not in scores.by_metric:
+    name = f"rollout_rmse_{channel}"
+    if scores is None or name not in scores.by_metric:
         raise InputError(f"shrinkage: found none of {channel}, needs a diagnosis that names an effect")
-    at = np.arange(len(names))
-    each = [scores.by_metric[name] for name in names]
-    lines: Sequence[tuple[str, list[float], str, str]] = (
-        ("baseline simulator", [c.before for c in each], VERMILLION, "o"),
-        ("baseline with black box", [scores.ceiling[name] for name in names], GREY, "x"),
-        ("with the effect", [c.after for c in each], BLUE, "o"),
-        ("noise floor", [c.floor for c in each], SKY, "_"),
+    own = scores.by_metric[name]
+    bars: Sequence[tuple[str, float, str]] = (
+        ("baseline simulator", own.before, VERMILLION),
+        ("baseline with black box", scores.ceiling[name], GREY),
+        ("with the effect", own.after, BLUE),
+        ("noise floor", own.floor, SKY),
     )
-    for label, values, colour, marker in lines:
-        ax.plot(at, values, color=colour, marker=marker, lw=1.2, ms=7, label=label)
-    ax.set_xticks(at, ["whole drive" if c.horizon_s is None else f"{c.horizon_s:.3g} s" for c in each])
-    ax.set(xlabel="rollout over", ylabel=f"error of {_NAMES[channel]}")
+    for at, (label, value, colour) in enumerate(bars):
+        ax.bar(at, value, color=colour, width=0.6, label=label)
+    over = "" if own.horizon_s is None else f" in free runs of {own.horizon_s:.3g} s"
+    ax.set_xticks([])
+    ax.set(xlabel=f"held-out blocks{over}", ylabel=f"error of {_NAMES[channel]}")
     ax.set_ylim(0, None)
     return ax
-
-
-def _metric(channel: str, horizon: str) -> str:
-    return f"rollout_rmse_{channel}" + ("" if horizon == "10s" else f"_{horizon}")
 
 
 def loop_gain(ax: Axes, chains: Mapping[str, tuple[Chain, dict]], *, colours: Mapping[str, str] | None = None) -> Axes:

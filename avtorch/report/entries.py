@@ -14,16 +14,8 @@ from avtorch.gap.result.diagnosis import Diagnosis, Quantity, Shrinkage
 from avtorch.report.table import Table
 
 _METRICS = {
-    "rollout_rmse_accel_0.5s": "acceleration, {horizon} s [m/s²]",
-    "rollout_rmse_accel_2s": "acceleration, {horizon} s [m/s²]",
     "rollout_rmse_accel": "acceleration, {horizon} s [m/s²]",
-    "rollout_rmse_accel_whole": "acceleration, whole drive [m/s²]",
-    "rollout_rmse_speed_0.5s": "speed, {horizon} s [m/s]",
-    "rollout_rmse_speed_2s": "speed, {horizon} s [m/s]",
     "rollout_rmse_speed": "speed, {horizon} s [m/s]",
-    "rollout_rmse_speed_whole": "speed, whole drive [m/s]",
-    "closed_loop_rmse_speed": "speed, closed loop [m/s]",
-    "closed_loop_rmse_spacing": "spacing, closed loop [m]",
     "log_predictive_density": "log predictive density [nats per row]",
 }
 

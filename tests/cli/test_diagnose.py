@@ -8,9 +8,8 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -21,10 +20,7 @@ from avtorch.cli import main
 from avtorch.cli.diagnosis_table import bar, diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, DeadTime, GapPlant, plant
-from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.result.diagnosis import Candidate, Diagnosis, GapSize, LogFacts, Quantity, near, verdict_of
-from avtorch.gap.search.checkpoint import Checkpoint, FitKey, StoredFit, read_fits
-from avtorch.gap.search.fitted_work import fitted_work
 from avtorch.io import Log
 
 ROWS = 600
@@ -58,27 +54,16 @@ def answer(logs: Sequence[Log], candidates: tuple[Candidate, ...] = CANDIDATES, 
 
 
 class Search:
-    """A stub of `avtorch.gap.diagnose`: records its arguments, stores fits in the same way, and answers."""
+    """A stub of `avtorch.gap.diagnose`: records its arguments, tells its steps, and answers."""
 
     def __init__(self) -> None:
         self.calls: list[dict[str, Any]] = []
-        self.interrupted_after: int | None = None
         self.more: dict[str, Any] = {}
 
-    def diagnose(self, logs: list[Log], *, checkpoint: Path, progress: Callable, **given: Any) -> Diagnosis:
-        base = given["baseline"] or plant()
-        kinds = [EFFECTS[name] for name in given["effects"] or EFFECTS]
-        each = [replace(log, accel_kind=given["accel_kind"]) for log in logs]
-        work = fitted_work(each, base, kinds, pairs=given["pairs"])
-        kept = Checkpoint(checkpoint, work)
-        before = len(read_fits(checkpoint, work)) if checkpoint.exists() else 0
-        self.calls.append({"logs": logs, "fits_before": before, **given})
-        for k in range(before, 4):
-            if k == self.interrupted_after:
-                raise KeyboardInterrupt
-            progress("single effects", k, 4)
-            start = FitKey(SimpleNamespace(name=f"effect_{k}"), None, f"{k:064x}")  # type: ignore[arg-type]
-            kept.keep(start, StoredFit(np.zeros(2), NoiseModel(), 0.0))
+    def diagnose(self, logs: list[Log], *, progress: Callable, **given: Any) -> Diagnosis:
+        self.calls.append({"logs": logs, **given})
+        for k in range(4):
+            progress("effects", k, 4)
         return answer(logs, **self.more)
 
 
@@ -145,7 +130,6 @@ def test_files_and_words(
     assert [log.name for log in call.pop("logs")] == [drive, other]
     assert call == {
         "material": 0.03,
-        "fits_before": 0,
         "baseline": None,
         "prior": None,
         "accel_kind": "kinematic",
@@ -204,107 +188,6 @@ def test_json_and_quiet(search: Search, drive: str, tmp_path: Path, capsys: pyte
 
 
 # --- interrupted, and on again
-
-
-def test_interrupted_then_on_again(
-    search: Search, drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "o"
-    search.interrupted_after = 2
-    assert main(["diagnose", drive, "--quiet", "--out", str(out)]) == 130
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert f"interrupted; no answer was written; finished fits are kept in {out / 'fits.json'}" in told
-    assert "the same command resumes there" in told
-    assert not (out / "diagnosis.json").exists()
-    search.interrupted_after = None
-    # budget, prior over causes and sampling of the posterior do not belong to the fits
-    more = ["--budget", "9", "--prior", "none=2", "--seed", "3", "--posterior", "laplace"]
-    assert main(["diagnose", drive, *more, "--quiet", "--out", str(out)]) == 0
-    assert [call["fits_before"] for call in search.calls] == [0, 2]
-    assert (out / "diagnosis.json").exists()
-
-
-def test_interrupted_before_anything_was_kept(
-    search: Search, drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    search.interrupted_after = 0
-    assert main(["diagnose", drive, "--quiet", "--out", str(tmp_path / "o")]) == 130
-    assert capsys.readouterr().err == "avtorch: interrupted; no answer was written\n"
-
-
-@pytest.mark.parametrize(
-    ("options", "fault"),
-    [
-        (["--accel-kind", "specific-force"], "begun with accel_kind kinematic;"),
-        (["--baseline", "dead_time=0.1"], "begun with baseline T_L=0.3, K_L=1;"),
-        (["--effects", "gust"], "begun with effects "),
-        (["--no-pairs"], "begun with pairs True;"),
-    ],
-)
-def test_fits_of_other_settings_are_not_taken(
-    search: Search,
-    drive: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    options: list[str],
-    fault: str,
-) -> None:
-    out = str(tmp_path / "o")
-    assert main(["diagnose", drive, "--quiet", "--out", out]) == 0
-    assert main(["diagnose", drive, *options, "--quiet", "--out", out]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert fault in told
-    assert "remove it to begin anew (avtorch diagnose --no-resume), or use another folder" in told
-    assert main(["diagnose", drive, *options, "--quiet", "--no-resume", "--out", out]) == 0
-    assert [call["fits_before"] for call in search.calls] == [0, 0]
-
-
-def test_fits_of_other_logs_are_not_taken(
-    search: Search, drive: str, other: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "o"
-    assert main(["diagnose", drive, "--quiet", "--out", str(out)]) == 0
-    answer_before = (out / "diagnosis.json").read_bytes()
-    for logs in ([other], [drive, other]):
-        assert main(["diagnose", *logs, "--resume", "--quiet", "--out", str(out)]) == 2
-        assert f"begun with other logs ({drive}, {ROWS} rows);" in capsys.readouterr().err
-    assert (out / "diagnosis.json").read_bytes() == answer_before
-    # the same rows under another name are the same work
-    renamed = Path(drive).rename(tmp_path / "renamed.csv")
-    assert main(["diagnose", str(renamed), "--quiet", "--out", str(out)]) == 0
-    assert search.calls[-1]["fits_before"] == 4
-
-
-@pytest.mark.slow
-def test_fits_that_cannot_be_believed(
-    search: Search, drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Damaged, of an earlier avtorch, or no file at all: one line, and --no-resume begins anew where it may."""
-    out = tmp_path / "o"
-    assert main(["diagnose", drive, "--quiet", "--out", str(out)]) == 0
-    whole, answer_before = (out / "fits.json").read_bytes(), (out / "diagnosis.json").read_bytes()
-    for content in (whole[:-9], whole.replace(b"0.0", b"0.1", 1), b'{"fits": []}', b"", b"\xff"):
-        (out / "fits.json").write_bytes(content)
-        (out / "fits_of.json").write_text("{}", encoding="utf-8")
-        assert main(["diagnose", drive, "--quiet", "--out", str(out)]) == 2
-        told = capsys.readouterr().err
-        assert told.count("\n") == 1
-        assert f"{out / 'fits.json'}: is damaged" in told
-        assert "--no-resume" in told
-        assert (out / "diagnosis.json").read_bytes() == answer_before
-    assert main(["diagnose", drive, "--no-resume", "--quiet", "--out", str(out)]) == 0
-    assert not (out / "fits_of.json").exists()
-    (out / "fits.json").unlink()
-    (out / "fits.json").symlink_to(tmp_path / "elsewhere")
-    assert main(["diagnose", drive, "--quiet", "--out", str(out)]) == 2
-    assert "fits.json: is a symbolic link" in capsys.readouterr().err
-    assert main(["diagnose", drive, "--no-resume", "--quiet", "--out", str(out)]) == 0
-    (out / "fits.json").unlink()
-    (out / "fits.json").mkdir()
-    assert main(["diagnose", drive, "--no-resume", "--quiet", "--out", str(out)]) == 2
-    assert "fits.json cannot be removed (Is a directory); needs another folder" in capsys.readouterr().err
 
 
 # --- bad input

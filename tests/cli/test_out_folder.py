@@ -1,9 +1,8 @@
-"""One process at a time in `--out`, and two diagnoses in one folder, one of them interrupted."""
+"""One process at a time in `--out`."""
 
 from __future__ import annotations
 
 import inspect
-import json
 import os
 import subprocess
 import sys
@@ -15,9 +14,7 @@ import pytest
 from avtorch.cli import main
 from avtorch.cli.app import app
 from avtorch.cli.out_folder import alone_in_out
-from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.io import sole_use
-from tests.gap.search.test_checkpoint import drive
 
 COMMANDS = {"run", "estimate", "diagnose", "compare", "fleet", "stability", "validate", "blindtest", "paper"}
 
@@ -112,42 +109,3 @@ def test_where_there_are_no_locks_a_line_says_so(
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "has no locks; keep other runs out of this folder" in said
-
-
-@pytest.mark.slow
-def test_two_diagnoses_in_one_folder_do_not_mix(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """One is interrupted, another starts in its folder, the first resumes: its answer is as if it had run alone."""
-    logs = []
-    for i, bias in enumerate((0.25, 0.1)):
-        logs.append(str(tmp_path / f"{i}.csv"))
-        drive(3 + i, bias=bias).write(logs[-1])
-    options = ["--effects", "sensor_bias,dead_time", "--no-pairs", "--posterior", "laplace", "--quiet", "--out"]
-    alone, shared = tmp_path / "alone", tmp_path / "shared"
-    assert main(["diagnose", logs[0], *options, str(alone)]) == 0
-    keep = Checkpoint.keep
-
-    def stopped(self: Checkpoint, *given: Any) -> None:
-        keep(self, *given)
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Checkpoint, "keep", stopped)
-        assert main(["diagnose", logs[0], *options, str(shared)]) == 130
-    capsys.readouterr()
-    kept = (shared / "fits.json").read_bytes()
-    assert main(["diagnose", logs[1], *options, str(shared)]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert f"fits.json: was begun with other logs ({logs[0]}, 400 rows)" in told
-    assert (shared / "fits.json").read_bytes() == kept
-    assert main(["diagnose", logs[0], *options, str(shared)]) == 0
-    answers = [json.loads((folder / "diagnosis.json").read_text(encoding="utf-8")) for folder in (alone, shared)]
-    assert answers[0] == answers[1]
-    # and a file of fits that is copied over
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / "fits.json").write_bytes(kept)
-    assert main(["diagnose", logs[1], *options, str(other)]) == 2
-    assert "was begun with other logs" in capsys.readouterr().err

@@ -6,29 +6,19 @@ Damage under an intact checksum is tried as well: the seal is no signature, so c
 from __future__ import annotations
 
 import hashlib
-import math
-from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from avtorch.gap import plant
-from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.search.checkpoint import SCHEMA, read_fits
-from avtorch.gap.search.fitted_work import fitted_work
 from avtorch.inference import BeliefStream, SamplerSettings
-from avtorch.io import Log
-from avtorch.io.sealed import write_sealed
 
 from .mutations import Raw, fuzzed, mutated, other_number, outcome
 
-FIT = {"name": "dead_time", "onset": None, "inputs": 64 * "a", "z": [0.1, -0.2, 0.3], "log_prior": -1.5}
 SETTINGS = SamplerSettings(chains=8, draws=16, burn_in=4)
 
 
@@ -37,23 +27,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
 
 
-@cache
-def work() -> dict[str, Any]:
-    log = Log.from_arrays(**{name: [0.0] * 24 for name in ("accel_cmd", "accel")}, time=[k / 20 for k in range(24)])
-    return fitted_work([log], plant(), [], pairs=False)
-
-
 def new_stream() -> BeliefStream:
     return BeliefStream(vehicles=1, settings=SETTINGS, kept=8, seed=4)
 
 
 @cache
 def whole() -> dict[str, bytes]:
-    """A file of fits, and the state of a stream in the middle of its first window."""
+    """The state of a stream in the middle of its first window."""
     with TemporaryDirectory() as name:
         folder = Path(name)
-        content = {"fits": [FIT | {"noise": asdict(NoiseModel())}], "steps": []}
-        write_sealed(folder / "fits", content, schema=SCHEMA, of=work())
         stream, time = new_stream(), torch.arange(90, dtype=torch.float64) / 100
         wave = torch.sin(3 * time)[None]
         stream.feed(time, {"accel": wave, "accel_cmd": wave, "jerk": wave})
@@ -72,18 +54,6 @@ def damaged(draw: st.DrawFn, name: str) -> tuple[Raw, bool]:
     schema = first.split(b'"')[3]
     checksum = hashlib.sha256(schema + b"\n" + rest).hexdigest().encode()
     return Raw(b'{"schema": "' + schema + b'", "sha256": "' + checksum + b'",\n' + rest), True
-
-
-@fuzzed("states")
-@given(damage=damaged("fits"))
-def test_damaged_fits(folder: Path, damage: tuple[bytes, bool]) -> None:
-    raw, resealed = damage
-    (folder / "fits.json").write_bytes(raw)
-    fits = outcome(lambda: read_fits(folder / "fits.json", work()))
-    assert fits is None or resealed or raw == whole()["fits"]
-    for fit in fits or ():
-        assert set(fit) == {*FIT, "noise"}
-        assert all(map(math.isfinite, fit["z"]))
 
 
 @fuzzed("states")

@@ -24,6 +24,7 @@ from avtorch.gap.engine.likelihood import log_sum
 from avtorch.gap.engine.outliers import Outliers, sensor_outliers
 from avtorch.gap.engine.priors import (
     EFFECT_NATS,
+    EFFECT_NATS_ALONE,
     FAINT_OF_RANGE,
     OUTLIER_NATS,
     SLOW_FORCE_NATS,
@@ -118,9 +119,8 @@ def examined_sets(search: Search) -> list[Examined]:
     ranked.sort(key=lambda h: -_ranking(h))
     chosen = [h for h in ranked if _ranking(h) > _ranking(ranked[0]) - _WITHIN][:_EXAMINED]
     for h in [
-        search.visited[()],
-        *[h for h in ranked if h.effects == ["~linear"]][:1],
-        *[h for h in ranked if len(h.effects) == 1][:2],
+        search.visited[search.key(search.base)],
+        *[h for h in ranked if len(h.effects) == len(search.base.effects) + 1][:2],
     ]:
         if h not in chosen:
             chosen.append(h)
@@ -267,15 +267,13 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
     named = [e for e in h.effects if not e.startswith("~") and EFFECTS[e].size(h.values, h.neutral) > 1]
     names = sorted({base_name(e) for e in named})
     count = sum(not e.startswith("~") for e in h.effects)
-    odds = -EFFECT_NATS * count
+    each = EFFECT_NATS_ALONE if alone else EFFECT_NATS
+    odds = -each * count
     # outliers that other sets explain are none: more effects may not make more of them
     spikes = [
         y.outliers.nats for y in examined if y.outliers is not None and set(y.hypothesis.effects) <= set(h.effects)
     ]
     spike = min(spikes) if spikes else -np.inf
-    unnamed = "~linear" in h.effects and not names
-    if alone and not names and max((c.nats for c in x.compositions if c.form), default=0.0) > 10:
-        unnamed = True
     for c in x.compositions:
         if alone and c.form and (h.data.channel_count == 1 or c.form == "linear"):
             continue
@@ -283,7 +281,7 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
         for effect, (size, gain) in x.beside.items():
             if effect in names:  # the error of the others' shape
                 others = [e for e in h.effects if base_name(e) != effect]
-                worth = shape_log_odds(size, gain, others) + EFFECT_NATS
+                worth = shape_log_odds(size, gain, others) + each
                 labels.append(([n for n in names if n != effect], worth))
         if x.mirror:
             labels += _echoes(x, names)
@@ -301,9 +299,6 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
             if slow != "none":
                 sd = c.slow.gust_sd if slow == "gust" else c.slow.road_sd
                 value -= SLOW_FORCE_NATS + (_FAINT_GUST / sd) ** 2
-            if unnamed and not (alone and slow == "gust"):
-                label = None
-                value -= UNKNOWN_NATS
             causes = None
             if label is not None:
                 faint = slow == "gust" and c.slow.gust_sd < _FAINT_GUST

@@ -6,23 +6,39 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, Self
 
 import numpy as np
 import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name, neutral_values
+from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.simulator.simulator_input import SimulatorInput
 
-if TYPE_CHECKING:
-    from avtorch.gap.engine.hypothesis import Hypothesis
+
+class Car(Protocol):
+    """What a `Hypothesis` has that a plant is made of."""
+
+    data: DriveData
+    values: FloatArray
+    effects: list[str]
+    onsets: dict[str, float]
+    shift_speeds: FloatArray
+    lost: tuple[tuple[int, int], ...]
+    baseline: GapPlant | None
+
+    def __getitem__(self, name: str) -> float: ...
+    def onset_vector(self) -> FloatArray: ...
+    def command(self) -> FloatArray: ...
+    def copy(self) -> Self: ...
+    def without(self, effect: str) -> Self: ...
 
 
-def effect_values(h: Hypothesis, effect: str) -> dict[str, Any]:
+def effect_values(h: Car, effect: str) -> dict[str, Any]:
     """Fields of the table's effect (keys of `Effect.of`) at the hypothesis's values; times from the first log's
     start."""
     own = EFFECTS[effect]
@@ -37,19 +53,21 @@ def effect_values(h: Hypothesis, effect: str) -> dict[str, Any]:
         out["rearm_mps"] = h["shift_hysteresis"]
     elif own.base in ("speed_dependent_lag", "speed_dependent_gain"):
         out["mean_speed"] = h.data.reference_speed
+    elif effect == "driveline_oscillation":
+        out["amplitude"] = 0.0
     elif effect == "command_hold":
         rows = sum(j - i for i, j in h.lost)
         out["hold_fraction"] = rows / len(h.data.time)
     return out
 
 
-def table_effect(h: Hypothesis, effect: str) -> Effect:
+def table_effect(h: Car, effect: str) -> Effect:
     """The table's effect at the hypothesis's values."""
     kind, given = EFFECTS[effect].kind or TABLE[base_name(effect)], effect_values(h, effect)
     return kind(**{f.name: given[f.name] for f in fields(kind) if f.name in given})
 
 
-def plant_of(h: Hypothesis, baseline: GapPlant | None = None) -> GapPlant:
+def plant_of(h: Car, baseline: GapPlant | None = None) -> GapPlant:
     """The repaired simulator: the baseline's effects, those of the hypothesis, its lag and gain. What sets in later
     acts from the start, but for a change of the gain."""
     own = [table_effect(h, e) for e in h.effects if not e.startswith("~")]
@@ -79,9 +97,7 @@ def neutral_of(baseline: GapPlant) -> FloatArray:
     return out
 
 
-def simulator_signals(
-    h: Hypothesis, values: FloatArray, onsets: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray]:
+def simulator_signals(h: Car, values: FloatArray, onsets: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
     """What `Hypothesis.on_grid` returns, by the simulator itself, which also has a user's own effects.
 
     An effect that sets in during the drive is spliced: its response from then on, the other one's before.
@@ -106,7 +122,7 @@ def simulator_signals(
     return accel, gained
 
 
-def _signals(h: Hypothesis) -> tuple[FloatArray, FloatArray]:
+def _signals(h: Car) -> tuple[FloatArray, FloatArray]:
     grid, car = h.data.grid, plant_of(h, h.baseline)
     command, speed = h.command()[grid.row], h.data.speed is not None
     starts = np.append(np.flatnonzero(grid.starts), len(grid.time)).tolist()

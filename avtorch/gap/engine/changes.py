@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from avtorch.gap.engine.joint import (
 )
 from avtorch.gap.engine.likelihood import claimed, log_sum
 from avtorch.gap.engine.priors import EFFECT_NATS, TEMPER, UNKNOWN_NATS
+from avtorch.gap.engine.shape_error import effect_energy, relative_size, shape_log_odds
 
 Progress = Callable[[str, int, int], None]
 
@@ -53,6 +54,11 @@ class Scatter:
         return max(self.likelihood, self.blocks) + self.drift
 
     @property
+    def drifts(self) -> bool:
+        """Whether halves of one side disagree more than their blocks do."""
+        return self.drift > max(self.likelihood, self.blocks)
+
+    @property
     def temper(self) -> float:
         return min(TEMPER, self.likelihood / self.variance)
 
@@ -70,7 +76,8 @@ class ChangePosterior:
     """`steps`: sets from one car on, each with one change more than the last; `visited` all of them.
 
     `best`: the last set. `scatter` of each change in it. `siblings`: what else was tried where a change entered, with
-    probabilities among them. `rejected`: the strongest change of the last step, which did not enter, with its scatter.
+    probabilities among them. `rejected`: the strongest change of the last step, which did not enter, its
+    scatter, and its log odds [nats] if it had none.
     `unknown`: probability that free forms differ besides.
     """
 
@@ -134,8 +141,9 @@ def search_changes(model: JointModel, changes: list[Change], progress: Progress 
             visited[_key(v.fit)] = v
         best = max(each, key=lambda v: v.log_weight)
         chosen = _alike(each)
+        now = visited[_key(now.fit)] = _with_wrong_shape(model, now, best)
         if best.log_weight < now.log_weight:
-            rejected = found, scatter, found.evidence - now.fit.evidence
+            rejected = found, scatter, found.evidence - now.fit.evidence - EFFECT_NATS
             break
         siblings[best.fit.changes[-1].key] = chosen
         now = best
@@ -157,6 +165,20 @@ def scatter_of(model: JointModel, fit: JointFit, change: Change) -> Scatter:
     return Scatter(float(likelihood[at, at]), float(blocks[at, at]), float(drift[at]))
 
 
+def lag_or_dead_time(model: JointModel) -> tuple[JointFit, float, float]:
+    """Probabilities that lag and gain alone have changed, and that the dead time alone has; the fit with all three."""
+    lag, gain, delay = map(of_car, ("T_L", "K_L", "dead_time"))
+    one = [model.with_change(model.start, change) for change in (lag, gain, delay)]
+    two = model.with_change(one[0], gain)
+    three = model.with_change(two, delay)
+    fits = [one[0], one[1], two, one[2], model.with_change(one[0], delay), model.with_change(one[1], delay), three]
+    best = max(fits, key=lambda f: f.evidence)
+    temper = min(scatter_of(model, best, change).temper for change in best.changes)
+    logs = np.array([temper * f.evidence - TEMPER * EFFECT_NATS * len(f.changes) for f in fits])
+    p = np.exp(logs - log_sum(logs))
+    return three, float(p[:3].sum()), float(p[3])
+
+
 # inside ---------------------------------------------------------------------------------------------------------------
 def _key(fit: JointFit) -> frozenset[tuple[str, bool]]:
     return frozenset(c.key for c in fit.changes)
@@ -164,6 +186,19 @@ def _key(fit: JointFit) -> frozenset[tuple[str, bool]]:
 
 def _weight(now: Visited, fit: JointFit, temper: float) -> float:
     return now.log_weight + temper * (fit.evidence - now.fit.evidence) - TEMPER * EFFECT_NATS
+
+
+def _with_wrong_shape(model: JointModel, now: Visited, best: Visited) -> Visited:
+    """A set with what another change gains beside it as far as that is an error in the shape of its own changes."""
+    if not now.fit.changes:
+        return now
+    after = not best.fit.changes[-1].less
+    data, noise = model.sides[after], best.fit.noise[after]
+    first, with_all = now.fit.sides[after].predicted, best.fit.sides[after].predicted
+    energy = effect_energy(data, first - model.start.sides[after].predicted)
+    size = relative_size(data, noise, with_all - first, energy)
+    worth = shape_log_odds(min(size, 99.0), best.fit.evidence - now.fit.evidence, ()) + EFFECT_NATS
+    return Visited(now.fit, float(np.logaddexp(now.log_weight, best.log_weight + TEMPER * worth)))
 
 
 def _alike(each: list[Visited]) -> tuple[str, ...]:

@@ -65,8 +65,8 @@ class Coordinate:
     """One coordinate: `name` in the vector, `parameter` of the effect in the table, `link` from one to the other.
 
     `low`, `high`: limits of a fit. `mean` not None: a nuisance with a normal prior of that mean and `scale`; otherwise
-    its size counts, with a Student prior of that `scale` that vanishes below `faint`. `signed`: either sign is
-    possible.
+    its size counts from `neutral` on, with a Student prior of that `scale` that vanishes below `faint`. `signed`:
+    either sign is possible.
     """
 
     name: str
@@ -78,6 +78,7 @@ class Coordinate:
     faint: float = 0.0
     mean: float | None = None
     sign: int = 1
+    neutral: float = 0.0
 
     @property
     def signed(self) -> bool:
@@ -153,7 +154,7 @@ def _nuisance(name: str, parameter: str, mean: float, sd: float, low: float, hig
 
 
 _SPEED, _ACCEL, _BOTH = frozenset({"speed"}), frozenset({"accel"}), frozenset({"accel", "speed"})
-_RING = tuple((0.3, 0.0, f) for f in (1.0, 1.25, 1.6, 2.0, 2.5, 3.0, 3.6, 4.4))
+_RING = tuple((0.3, f) for f in (1.0, 1.25, 1.6, 2.0, 2.5, 3.0, 3.6, 4.4))
 
 _square = Coordinate(
     "square_period", "inverse_frequency_s", "square", 0.0, 4.0, SCALE_OF_RANGE / 9, FAINT_OF_RANGE / 12**2
@@ -239,15 +240,16 @@ EFFECTS: dict[str, EngineEffect] = {
             (
                 # a ring follows a step in its direction; the other sign would be one more lag
                 Coordinate("ring_quadrature", "quadrature", "value", 0, 4, 0.3, FAINT_OF_RANGE * 0.5 / 3),
-                _nuisance("ring_amplitude", "amplitude", 0.0, 0.3, -1.0, 1.0),
                 _nuisance("ring_frequency", "frequency_hz", 2.5, 1.2, 0.8, 5.5),
             ),
             _RING,
+            "may",
+            _BOTH,
         ),
         EngineEffect(
             "~linear",
             (
-                Coordinate("free_pole", "", "value", -3, 0, 0.3),
+                _nuisance("free_pole", "", 0.0, 0.3, -3.0, 0.0),
                 _nuisance("free_frequency", "", 1.8, 0.8, 0.6, 3.5),
             ),
             ((-0.2, 1.0), (-0.2, 1.8), (-0.8, 1.8), (-0.2, 2.8)),
@@ -306,15 +308,14 @@ EFFECTS: dict[str, EngineEffect] = {
 COORDINATES: dict[str, Coordinate] = {c.name: c for e in EFFECTS.values() for c in e.coordinates}
 """Coordinates of effects by their names."""
 
-_OWN_NEUTRAL: dict[str, float] = {}
-
 
 def neutral_values() -> FloatArray:
     """A new value vector (parameter,) at which the plant is GLVD."""
     out = np.zeros(len(INDEX))
     out[: len(NEUTRAL)] = NEUTRAL
-    for name, value in _OWN_NEUTRAL.items():
-        out[INDEX[name]] = value
+    for c in COORDINATES.values():
+        if INDEX[c.name] >= len(NEUTRAL):
+            out[INDEX[c.name]] = c.neutral
     return out
 
 
@@ -342,8 +343,7 @@ def _own(kind: type[Effect], p: Parameter) -> Coordinate:
     name, (low, high) = f"{kind.name}.{p.name}", p.physical
     if p.neutral is None:
         mean = float(p.typical())
-        _OWN_NEUTRAL[name] = mean
-        return Coordinate(name, p.name, "value", low, high, (p.high - p.low) / 2.56, mean=mean)
+        return Coordinate(name, p.name, "value", low, high, (p.high - p.low) / 2.56, mean=mean, neutral=mean)
     if math.isinf(p.neutral):
         sign = 1 if p.neutral > 0 else -1
         near, far = sorted(1 / abs(x) for x in (p.low, p.high))
@@ -353,7 +353,8 @@ def _own(kind: type[Effect], p: Parameter) -> Coordinate:
         far = max(abs(math.log(p.low)), abs(math.log(p.high)))
         ends = math.log(low), math.log(high)
         return Coordinate(name, p.name, "log", *ends, SCALE_OF_RANGE * far, FAINT_OF_RANGE * far / 3)
-    _OWN_NEUTRAL[name] = p.neutral
+    low, high = min(low, p.neutral), max(high, p.neutral)
     away = sorted(abs(x - p.neutral) for x in (p.low, p.high))
     near = away[1] / 3 if p.low < p.neutral < p.high else away[0]
-    return Coordinate(name, p.name, "value", low, high, SCALE_OF_RANGE * away[1], FAINT_OF_RANGE * near)
+    size = SCALE_OF_RANGE * away[1], FAINT_OF_RANGE * near
+    return Coordinate(name, p.name, "value", low, high, *size, neutral=p.neutral)

@@ -8,9 +8,9 @@ interruption. With score s and information A of `demand_filter`, and with the ot
     gain of a level = -depth s~' p_g - 1/2 depth² p_g' A~ p_g,    A~ = A - Z' N^-1 Z,   Z = scores of J's columns,
 
 s~ being the score that is left when those parameters have taken what they can (Frisch, Waugh and Lovell). Levels are
-added one by one, each with its own depth (matching pursuit; Mallat and Zhang 1993); `refined_shift_speeds` moves, drops
-and adds them under one common depth, level by level (coordinate ascent), and tries every distinct re-arming hysteresis.
-The response is simulated only to accept the outcome.
+added one by one, each with its own depth (matching pursuit; Mallat and Zhang 1993). `refined_shift_speeds` moves, drops
+and adds them under one common depth, level by level (coordinate ascent); only the hysteresis at which gears rearm, and
+the last step, in which speeds, duration and all other parameters are fitted together, are simulated.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from avtorch.gap.engine.demand_filter import (
     take_out,
 )
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.gauss_newton import jacobian, objective, prior_terms, whitened_jacobian
+from avtorch.gap.engine.gauss_newton import fit, jacobian, objective, prior_terms, whitened_jacobian
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import SHIFT_NATS, WARM_S
@@ -56,7 +56,9 @@ _NEAR_MPS = 0.6  # how far a level moves at once
 _FINE_MPS = 0.02  # resolution of its place
 _DISTINCT_MPS = 0.05  # smaller dips of the speed are noise
 _MOST_HYSTERESIS_MPS = 4.0  # a gear that has not changed back by then never does
+_PLACES = 8  # hystereses tried at once
 _LEAST_DEPTH = 0.05  # a level that does nothing cannot be placed
+_TOGETHER = ("T_L", "K_L", "shift_depth", "shift_duration")  # fitted with speeds
 _LEAST_NATS = 0.5  # a change that gains less is none
 
 
@@ -86,51 +88,91 @@ def refined_shift_speeds(h: Hypothesis) -> Hypothesis:
     gains."""
     best = h
     for _ in range(_PASSES):
-        shifts = _Shifts(best)
-        if not (shifts.ascend() or best is h) or not shifts.levels:
+        begun = _rearmed(best)
+        shifts = _Shifts(begun)
+        moved = shifts.ascend()
+        if not shifts.levels or not (moved or begun is not best or best is h):
             break
-        new = best.copy()
+        new = begun.copy()
         new.shift_speeds = np.array(sorted(shifts.levels))
-        new["shift_hysteresis"], new["shift_depth"] = shifts.hysteresis, shifts.depth
-        new["shift_duration"] = shifts.duration
-        new = fit_with_speeds(new)
+        new["shift_depth"], new["shift_duration"] = shifts.depth, shifts.duration
+        new = _pruned(fit_with_speeds(new))
         if _objective(new) <= _objective(best) + _LEAST_NATS:
             break
         best = new
     return best
 
 
-def fit_with_speeds(h: Hypothesis, iterations: int = 4) -> Hypothesis:
-    """The hypothesis at the maximum of `objective` with its shift speeds free, too, by Gauss-Newton.
+def _pruned(h: Hypothesis) -> Hypothesis:
+    """The hypothesis without the speeds that are not worth their price."""
+    for g in h.shift_speeds:
+        rest = h.copy()
+        rest.shift_speeds = h.shift_speeds[h.shift_speeds != g]
+        if len(rest.shift_speeds) and _objective(rest.evaluate()) > _objective(h):
+            h = rest
+    return h
 
-    An upshift is read between rows, so the response is differentiable in a speed. Speeds and the duration belong
-    together: an interruption that begins early looks long.
+
+def _rearmed(h: Hypothesis) -> Hypothesis:
+    """The hypothesis with the best hysteresis; `h` where none gains.
+
+    Between two depths to which the speed dips below a level and comes back, all hystereses are the same. Too small
+    ones add upshifts and too large ones leave some out, so the likelihood rises up to the true one and falls behind it:
+    a few places along the list are tried, then those around the best.
     """
-    names = h.free
-    at = [INDEX[n] for n in names]
-    low, high = np.array([h.limits(n) for n in names]).T
-    h = h.copy().evaluate()
+    data = h.data
+    dips = [dips_below(data.smooth_speed, data.starts, float(g)) for g in h.shift_speeds]
+    edges = np.unique(np.concatenate([[_DISTINCT_MPS, _MOST_HYSTERESIS_MPS], *dips]))
+    edges = edges[(edges >= _DISTINCT_MPS) & (edges <= _MOST_HYSTERESIS_MPS)]
+    values = 0.5 * (edges[1:] + edges[:-1])
+    best, tried = h, set[int]()
+    first, last = 0, len(values) - 1
+    while True:
+        places = sorted(set(np.linspace(first, last, _PLACES).round().astype(int).tolist()) - tried)
+        for k in places:
+            new = h.copy()
+            new["shift_hysteresis"] = float(values[k])
+            if new.evaluate().log_likelihood > best.log_likelihood + _LEAST_NATS:
+                best = new
+        tried |= set(places)
+        near = int(np.abs(values - best["shift_hysteresis"]).argmin())
+        left, right = [k for k in tried if k < near], [k for k in tried if k > near]
+        first, last = max(left, default=0), min(right, default=len(values) - 1)
+        if not places or set(range(first, last + 1)) <= tried:
+            return best
+
+
+def fit_with_speeds(h: Hypothesis, iterations: int = 6) -> Hypothesis:
+    """The hypothesis at the maximum of `objective` with its shift speeds free, too, by damped Gauss-Newton.
+
+    An upshift is read between rows, so the response is differentiable in a speed. Speeds, depth and duration belong
+    together, as an interruption that begins early looks long and shallow; the recorder's parameters are fitted last.
+    """
+    at = [INDEX[n] for n in _TOGETHER]
+    low, high = np.array([h.limits(n) for n in _TOGETHER]).T
+    h, damping = h.copy().evaluate(), 1e-3
     for _ in range(iterations):
-        W = whitened_jacobian(h, np.concatenate([jacobian(h, names), _speed_derivatives(h)]))
-        precision, pull = prior_terms(h, names)
+        W = whitened_jacobian(h, np.concatenate([jacobian(h, _TOGETHER), _speed_derivatives(h)]))
+        precision, pull = prior_terms(h, _TOGETHER)
         none = np.zeros(len(h.shift_speeds))
         H = W @ W.T
-        H += np.diag(np.append(precision, none) + 1e-3 * np.diag(H) + 1e-12)
-        step = np.linalg.solve(H, W @ whiten(h.data, h.covariance, h.residual) + np.append(pull, none))
+        g = W @ whiten(h.data, h.covariance, h.residual) + np.append(pull, none)
         better = None
-        for share in (1.0, 0.5, 0.2):
+        while better is None and damping < 1e3:
+            A = H + np.diag(np.append(precision, none) + damping * np.diag(H) + 1e-12)
+            step = np.linalg.solve(A, g)
             new = h.copy()
-            new.values[at] = np.clip(h.values[at] + share * step[: len(at)], low, high)
-            new.shift_speeds = h.shift_speeds + share * np.clip(step[len(at) :], -_NEAR_MPS, _NEAR_MPS)
+            new.values[at] = np.clip(h.values[at] + step[: len(at)], low, high)
+            new.shift_speeds = h.shift_speeds + np.clip(step[len(at) :], -_NEAR_MPS, _NEAR_MPS)
             if (np.diff(new.shift_speeds) > 0).all() and objective(new.evaluate()) > objective(h):
                 better = new
-                break
+            damping = damping / 10 if better else damping * 8
         if better is None:
             break
         gain, h = objective(better) - objective(h), better
         if gain < 0.1 * _LEAST_NATS:
             break
-    return h
+    return fit(h, 3)
 
 
 def _speed_derivatives(h: Hypothesis) -> FloatArray:
@@ -277,20 +319,30 @@ def _pursued(
 
 
 class _Shifts:
-    """`levels` [m/s] with one `depth`, one `hysteresis` [m/s] and one duration of interruptions, and the `score` (row,)
-    beside all of them. All gains are of changes, so that what they leave as it is need not be computed."""
+    """`levels` [m/s] with a depth each, of one hysteresis [m/s] and one `duration` [s], and the `score` (row,) beside
+    all of them. All gains are of changes, so that what they leave as it is need not be computed.
+
+    Depths are free here, though the plant has one: the information is the mean over places in a frame, and what it is
+    wrong by at the few upshifts of a level then changes no sign.
+    """
 
     def __init__(self, h: Hypothesis) -> None:
         self.likelihood = _PulseLikelihood.of(h, h.residual)
         self.score = self.likelihood.score.copy()
-        self.levels = [float(g) for g in h.shift_speeds]
-        self.depth, self.hysteresis, self.duration = h["shift_depth"], h["shift_hysteresis"], h["shift_duration"]
-        if self.depth < _LEAST_DEPTH:  # speeds at which nothing happens: from none
-            self.levels, (self.depth, self.duration) = [], EFFECTS["gear_shift"].starts[0]
-        self._known: dict[tuple[float, float], tuple[_Pulses, _Size]] = {}
+        self.hysteresis, self.duration = h["shift_hysteresis"], h["shift_duration"]
+        self.levels = dict.fromkeys(h.shift_speeds.tolist(), h["shift_depth"])
+        if h["shift_depth"] < _LEAST_DEPTH:  # speeds at which nothing happens: from none
+            self.levels, self.duration = {}, EFFECTS["gear_shift"].starts[0][1]
+        self._known: dict[float, tuple[_Pulses, _Size]] = {}
+
+    @property
+    def depth(self) -> float:
+        """The common depth, each level's weighed by its information."""
+        sizes = [self._pulses(g)[1].own for g in self.levels]
+        return float(np.average(list(self.levels.values()), weights=sizes))
 
     def ascend(self) -> bool:
-        """Change levels, hysteresis and depth in turn while that gains; whether anything did."""
+        """Move, drop and add levels while that gains; whether anything did."""
         coarse = np.round(_levels(self.likelihood.data), 2)
         near = np.arange(-_NEAR_MPS, _NEAR_MPS + 1e-9, _FINE_MPS)
         total = 0.0
@@ -298,89 +350,43 @@ class _Shifts:
             gained = sum(self._move(g, np.round(g + near, 2)) for g in list(self.levels))
             while len(self.levels) < _MOST_LEVELS and (more := self._add(coarse)) > 0.0:
                 gained += more
-            gained += self._rearm() + self._deepen()
             total += gained
             if gained < _LEAST_NATS:
                 break
         return total >= _LEAST_NATS
 
-    def _pulses(self, level: float, hysteresis: float) -> tuple[_Pulses, _Size]:
-        key = level, hysteresis
-        if key not in self._known:
-            pulses = self.likelihood.pulses(self.likelihood.upshifts(level, hysteresis), self.duration)
-            self._known[key] = pulses, self.likelihood.size(pulses)
-        return self._known[key]
+    def _pulses(self, level: float) -> tuple[_Pulses, _Size]:
+        if level not in self._known:
+            pulses = self.likelihood.pulses(self.likelihood.upshifts(level, self.hysteresis), self.duration)
+            self._known[level] = pulses, self.likelihood.size(pulses)
+        return self._known[level]
 
-    def _gain(self, level: float) -> float:
-        """Nats of one more level, less its price."""
-        pulses, size = self._pulses(level, self.hysteresis)
-        return self.depth * (self.likelihood.gain(self.score, pulses) - 0.5 * self.depth * size.own) - SHIFT_NATS
-
-    def _put(self, level: float, depth: float) -> None:
-        self.likelihood.take_out(self.score, *self._pulses(level, self.hysteresis), depth)
+    def _gain(self, level: float, depth: float | None = None) -> tuple[float, float]:
+        """Nats of one more level, less its price, and its depth (None: the best one)."""
+        pulses, size = self._pulses(level)
+        slope = self.likelihood.gain(self.score, pulses)
+        if depth is None:
+            depth = min(max(slope / size.own, 0.0), 1.0) if size.own > _LEAST_NATS else 0.0
+        return depth * (slope - 0.5 * depth * size.own) - SHIFT_NATS, depth
 
     def _move(self, level: float, by: FloatArray) -> float:
         """Put the best of the levels `by` in place of one, or leave it out where none is worth its price."""
-        self.levels.remove(level)
-        self._put(level, -self.depth)
-        before = self._gain(level)
-        added = self._add(np.append(by[by > LOWEST_MPS], level))
-        return added - before
+        depth = self.levels.pop(level)
+        self.likelihood.take_out(self.score, *self._pulses(level), -depth)
+        before, _ = self._gain(level, depth)
+        return self._add(np.append(by[by > LOWEST_MPS], level)) - before
 
     def _add(self, levels: FloatArray) -> float:
         """Add the best of `levels` apart from the others, if it is worth its price; what it gains."""
         if self.levels:
-            levels = levels[_apart(levels, np.array(self.levels))]
-        gains = np.array([self._gain(float(g)) for g in levels])
-        if not len(gains) or gains.max() <= 0.0:
+            levels = levels[_apart(levels, np.array(list(self.levels)))]
+        gains = [self._gain(float(g)) for g in levels]
+        if not gains or (best := max(gains))[0] <= 0.0:
             return 0.0
-        k = int(gains.argmax())
-        self.levels.append(float(levels[k]))
-        self._put(self.levels[-1], self.depth)
-        return float(gains[k])
-
-    def _rearm(self) -> float:
-        """Take the best hysteresis: of those between two dips of the speed below a level and back, all are the same."""
-        dips = [dips_below(self.likelihood.data.smooth_speed, self.likelihood.data.starts, g) for g in self.levels]
-        edges = np.unique(np.concatenate([[_DISTINCT_MPS, _MOST_HYSTERESIS_MPS], *dips]))
-        edges = edges[(edges >= _DISTINCT_MPS) & (edges <= _MOST_HYSTERESIS_MPS)]
-        best, gain, score = self.hysteresis, _LEAST_NATS, self.score
-        for other in (0.5 * (edges[1:] + edges[:-1])).tolist():
-            beside = self.score.copy()
-            before, after = self._slope(self.score, other), 0.0
-            for hysteresis, depth in ((self.hysteresis, -self.depth), (other, self.depth)):
-                for g in self.levels:
-                    self.likelihood.take_out(beside, *self._pulses(g, hysteresis), depth)
-            after = self._slope(beside, other)
-            # s' w - w' A w / 2 = (s' w + (s - A w)' w) / 2, w being the change
-            if 0.5 * (before + after) > gain:
-                best, gain, score = other, 0.5 * (before + after), beside
-        changed = best != self.hysteresis
-        self.hysteresis, self.score = best, score
-        return gain if changed else 0.0
-
-    def _slope(self, score: FloatArray, other: float) -> float:
-        """Of log L along the change to another hysteresis."""
-        return self.depth * math.fsum(
-            self.likelihood.gain(score, self._pulses(g, other)[0])
-            - self.likelihood.gain(score, self._pulses(g, self.hysteresis)[0])
-            for g in self.levels
-        )
-
-    def _deepen(self) -> float:
-        """Take the best depth."""
-        beside = self.score.copy()
-        each = [self._pulses(g, self.hysteresis) for g in self.levels]
-        for pulses, size in each:
-            self.likelihood.take_out(beside, pulses, size, 1.0)
-        slope = math.fsum(self.likelihood.gain(self.score, pulses) for pulses, _ in each)
-        size = slope - math.fsum(self.likelihood.gain(beside, pulses) for pulses, _ in each)
-        if size <= 0.0:
-            return 0.0
-        more = min(max(slope / size, _LEAST_DEPTH - self.depth), 1.0 - self.depth)
-        self.score += more * (beside - self.score)
-        self.depth += more
-        return more * (slope - 0.5 * more * size)
+        level = float(levels[gains.index(best)])
+        self.levels[level] = best[1]
+        self.likelihood.take_out(self.score, *self._pulses(level), best[1])
+        return best[0]
 
 
 @njit(cache=True)

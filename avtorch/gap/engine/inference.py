@@ -83,7 +83,7 @@ def infer(
     told("average", 0, 1)
     named = [e for e in effects if not e.startswith("~")]
     found = average(examined_sets(search), alone=alone, effects=[*named, *map(_base, named)], most=most, prior=prior)
-    return Inference(base, search, found, alone)
+    return Inference(search.base, search, found, alone)
 
 
 def _base(effect: str) -> str:

@@ -4,8 +4,8 @@ r"""Two sets of drives of one car as one model, so that what differs between the
 
 Both sides share lag, gain, dead time and the free forms z of every family, one coefficient beta_j each: what the car
 does on both sides, in the table or not, is no change. Each side has a recorder and a noise of its own, free in every
-band. A change delta is a lag, gain or dead time of its own on the side after, or an effect on one side alone. Free forms
-are orthogonal to the shared parameters, in units of the noise, so that lag and gain stay what they are without them.
+band. A change delta is a lag, gain or dead time of its own on the side after, or an effect on one side alone. Free
+forms are orthogonal to the shared parameters, in units of the noise, so that lag and gain stay what they are without.
 
 A difference that comes and goes within one side is no change between them. The blocks of a drive tell how much an
 estimate scatters, the halves of either side how much the car drifts; where that is more than the likelihood says, the
@@ -15,16 +15,17 @@ likelihood is tempered down to it (a sandwich in place of the information; White
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from functools import cached_property
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError
-from avtorch.gap.engine.coordinates import COORDINATES, EFFECTS, INDEX, Coordinate, EngineEffect
+from avtorch.gap.engine.coordinates import COORDINATES, INDEX, Coordinate, EngineEffect
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.free_forms import COEFFICIENT_SD, demand_response, families
 from avtorch.gap.engine.gauss_newton import jacobian, normal_prior
@@ -295,7 +296,7 @@ class JointModel:
             return math.log(low), math.log(high)
         return (-math.log(8), math.log(8)) if c.link == "times" else (-high, high) if c.link == "plus" else (low, high)
 
-    def _at(
+    def at(
         self,
         changes: tuple[Change, ...],
         x: FloatArray,
@@ -319,7 +320,7 @@ class JointModel:
         for _ in range(rounds if count else 1):
             total = sum(gram(n, P) for n, P in zip(noise, sums, strict=True))
             assert isinstance(total, np.ndarray)
-            c = np.linalg.solve(total[1:, 1:] + self.sd**-2 * np.eye(count), total[1:, 0])
+            c = _solved(total[1:, 1:] + self.sd**-2 * np.eye(count), total[1:, 0])
             left = np.concatenate([[1.0], -c])
             noise = [noise_left(P, left, h.data) for P, h in zip(sums, sides, strict=True)]
         nats = sum(claimed(h.data, n, math.inf) for h, n in zip(sides, noise, strict=True))
@@ -368,7 +369,7 @@ class JointModel:
         """Gauss-Newton from `x` (coordinate,)."""
         changes = tuple(changes)
         low, high = np.array([self.limits(c) for c in self.coordinates(changes)]).T
-        now = self._at(changes, np.clip(x, low, high))
+        now = self.at(changes, np.clip(x, low, high))
         n, damping = len(now.x), 1e-3
         for _ in range(iterations):
             H, g = self._system(now, self._derivatives(now))
@@ -382,7 +383,7 @@ class JointModel:
                     step = np.zeros(len(g))
                     step[free] = np.linalg.solve(A[np.ix_(free, free)], g[free])
                     step = step[:n]
-                new = self._at(changes, np.clip(now.x + step, low, high), now.noise)
+                new = self.at(changes, np.clip(now.x + step, low, high), now.noise)
                 if new.objective > now.objective - 1e-9:
                     better = new
                     break
@@ -438,6 +439,11 @@ class JointModel:
         self.start = fit
         return fit
 
+    @cached_property
+    def blocks(self) -> int:
+        """Number of blocks of the side that has fewer."""
+        return min(len(blocks_of(side)) for side in self.sides)
+
     # how sure --------------------------------------------------------------------------------------------------------
     def covariance(self, fit: JointFit) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of the coordinates: by the likelihood, by blocks of the drives, and squares of drift (coordinate,).
@@ -445,7 +451,7 @@ class JointModel:
         Drift is what the halves of either side differ by, beyond what their blocks say.
         """
         n = len(fit.x)
-        C = np.linalg.inv(fit.information)
+        C = np.asarray(np.linalg.inv(fit.information), np.float64)
         likelihood, blocks = C[:n, :n], np.zeros((n, n))
         drift, weight = np.zeros(n), np.zeros(n)
         for k, h in enumerate(fit.sides):
@@ -489,14 +495,18 @@ def block_scores(h: Hypothesis, noise: FloatArray, derivatives: FloatArray, left
 
     r = rows(left)
     by_row = np.array([sum(a * b for a, b in zip(rows(d), r, strict=True)) for d in derivatives])
-    M = data.frame_rows
-    covered = [(i, i + (n + 1) * M) for i, n in data.frames]
+    return np.array([by_row[:, block].sum(1) for block in blocks_of(data)]).T
+
+
+def blocks_of(data: DriveData) -> list[slice]:
+    """Rows under the frames, in blocks of 10 s; in shorter ones where there are less than five."""
+    covered = [(i, i + (n + 1) * data.frame_rows) for i, n in data.frames]
     seconds = min(_BLOCK_S, sum(j - i for i, j in covered) * data.dt / _FEWEST_BLOCKS - 1e-6)
     out = []
     for i, j in covered:
-        count = max(1, int((j - i) * data.dt / seconds))
-        out += [part.sum(1) for part in np.array_split(by_row[:, i:j], count, axis=1)]
-    return np.array(out).T
+        edges = np.linspace(i, j, max(1, int((j - i) * data.dt / seconds)) + 1).round().astype(int).tolist()
+        out += [slice(a, b) for a, b in pairwise(edges)]
+    return out
 
 
 def products(data: DriveData, a: FloatArray, b: FloatArray) -> FloatArray:
@@ -521,3 +531,7 @@ def noise_left(products: FloatArray, left: FloatArray, data: DriveData) -> Float
     S = 0.5 * (S + np.swapaxes(S, 1, 2))
     trace = np.trace(S, axis1=1, axis2=2)
     return S + (_LEAST * trace)[:, None, None] * np.eye(data.channel_count)
+
+
+def _solved(A: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.solve(A, b), np.float64)

@@ -11,6 +11,8 @@ and no equation is exact (SafeBayes; Grünwald and van Ommen 2017). Fitted to ca
 
 EFFECT_NATS = 10.0
 """What the presence of one more effect costs before tempering [nats]: prior odds of exp(-2.5), one in twelve."""
+EFFECT_NATS_ALONE = 6.0
+"""The same with one channel [nats]: below `ONE_CHANNEL_HZ` there are tens of times fewer coefficients to be wrong in."""
 SLOW_FORCE_NATS = 7.0
 """The same for a slow random force (gust, road) [nats]: any drive meets some wind and slope."""
 UNKNOWN_NATS = 12.0

@@ -21,7 +21,7 @@ from avtorch.gap.engine.density import HypothesisDensity
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.laplace import Laplace
 from avtorch.gap.engine.priors import TEMPER
-from avtorch.gap.engine.surrogate import Corrected, Surrogate, reach, terms_of
+from avtorch.gap.engine.surrogate import Corrected, Surrogate, terms_of
 from avtorch.gap.engine.torch_plant import not_in_torch
 from avtorch.inference.coordinates import Coordinates, stiffness
 from avtorch.inference.importance import ImportanceSettings, weighted_draws
@@ -37,16 +37,18 @@ STEP = 2.0
 _INFLATED = 0.05  # relative increase of a variance by gradient noise
 _THROWN = 3.0  # [posterior standard deviations] largest displacement by one correction
 _RAREST = 16.0  # steps between corrections
+_PROBES = 16  # places where the surrogate's error is measured
+_REACHES = (3.0, 2.2, 1.6)  # of the surrogate, in standard deviations of its draws a root of their dimension
 _CLIFF = 9.0  # mean square error of the surrogate's whitened gradient above which no step suits the density
-_STEPS = 500.0  # of SGLD, most
+_STEPS = 300.0  # of SGLD, most
 _GRADIENT_STEPS = 1.2e7  # of the grid in exact gradients of the walk, most: five seconds on one core
-_LONGEST = 1_000_000  # steps of a grid whose responses fit in memory
+_LONGEST = 500_000  # steps of a grid whose responses fit in memory
 _CHECKED = 96  # draws that Stein's identity is checked at
 _LET_PASS = 0.15  # relative error of a variance
 _WIDER = 1.2  # spread of the surrogate's responses over that of the draws
 _SOUGHT = ImportanceSettings(rounds=4, enough=150.0)  # draws of the surrogate that the next one is fitted to
 _WEIGHED = ImportanceSettings(draws=200, rounds=4, enough=200.0)
-_FEWEST = 30.0  # effective draws by importance
+_FEWEST = 50.0  # effective draws
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,15 +128,14 @@ def _sampled(
     """Draws of the density by SGLD or importance; None where neither can be had; and why not by SGLD."""
     surrogate, mode = fitted(density, normal, generator)
     steepness = float(stiffness(density, Coordinates.of(mode)))
-    points = exact_one_in(density, surrogate, mode, steepness, generator)
-    target = Corrected(density, surrogate, max(points, 1))
+    target = corrected(density, surrogate, mode, steepness, generator)
     z, why = None, "gradients jump within a posterior standard deviation"
-    if points:
+    if target is not None:
         z, why = _walked(target, mode, steepness, chains, draws, generator)
-    if z is not None:
+    if z is not None and target is not None:
         x, worth = density.constrain(z), float(effective_sample_size(z).min())
-        return Draws(density.names, x.numpy(), "sgld", worth, 1 / points), ""
-    weighted = weighted_draws(target, _WEIGHED, generator=generator, mode=mode)
+        return Draws(density.names, x.numpy(), "sgld", worth, 1 / target.points), ""
+    weighted = weighted_draws(target or Corrected(density, surrogate, 1, 0.0), _WEIGHED, generator=generator, mode=mode)
     worth = float(weighted.effective[0])
     if worth < _FEWEST or not float(weighted.pareto_k[0]) < reliable(len(weighted.z)):
         return None, f"{why}; importance weights are not reliable either"
@@ -166,32 +167,34 @@ def _normal_mode(density: HypothesisDensity, normal: Laplace) -> Mode:
     return Mode(z[None], scale[None], torch.zeros(1, dtype=z.dtype), torch.tensor([True]))
 
 
-def exact_one_in(
+def corrected(
     density: HypothesisDensity, surrogate: Surrogate, mode: Mode, steepness: float, generator: torch.Generator
-) -> int:
-    """The interval n at which gradients must be exact, so that their noise widens the posterior within tolerance.
+) -> Corrected | None:
+    """The density with gradients of the surrogate where they will do; None where it is too steep for SGLD.
 
     Noise of variance s² in whitened gradients widens a variance by `step s² / 4`, with the step that suits the
     `steepness`. Correcting one gradient in n leaves `(n - 1)` times the squared error of the surrogate, measured at
-    draws like those that it was fitted to. 0 where that error is so large that the density is too steep
-    for SGLD. At the limit of the surrogate's range, a single correction must not displace a chain far either.
+    draws like those that it was fitted to. At the limit of its reach a single correction must not displace a chain far.
     """
-    size, count = mode.z.shape[-1], 16
-    w = torch.randn(count + size, 1, size, dtype=mode.z.dtype, generator=generator)
-    out = reach(size) / w.norm(dim=-1, keepdim=True)
-    z = (
-        surrogate.middle
-        + torch.cat([w[:count] * out[:count].clamp_max(1.0), w[count:] * out[count:]]) @ surrogate.spread.mT
-    )
-    lacking = (density.score(z) - surrogate.score(z)) @ mode.scale[0]
-    if not bool(lacking.isfinite().all()):
-        return 0
-    typical = float(lacking[:count].square().mean(0).max().clamp_min(1e-12))
-    if typical > _CLIFF:
-        return 0
-    farthest = float(lacking[count:].abs().max().clamp_min(1e-12))
-    step = STEP / steepness
-    return int(min(_RAREST, 1 + 4 * _INFLATED / (step * typical), 1 + _THROWN * STEP / (step * farthest)))
+    size, step = mode.z.shape[-1], STEP / steepness
+
+    def lacking(w: Tensor) -> Tensor:
+        z = surrogate.middle + w @ surrogate.spread.mT
+        return (density.score(z) - surrogate.score(z)) @ mode.scale[0]
+
+    w = torch.randn(_PROBES, 1, size, dtype=mode.z.dtype, generator=generator)
+    typical = float(lacking(w).square().mean(0).max())
+    if not typical <= _CLIFF:  # NaN is not either
+        return None
+    points = min(_RAREST, 1 + 4 * _INFLATED / (step * max(typical, 1e-12)))
+    unit = torch.randn(size, 1, size, dtype=mode.z.dtype, generator=generator)
+    for times in _REACHES:
+        reach = times * size**0.5
+        farthest = float(lacking(unit * reach / unit.norm(dim=-1, keepdim=True)).abs().max())
+        most = _THROWN * STEP / (step * max(farthest, 1e-12))
+        if most >= points:
+            break
+    return Corrected(density, surrogate, int(max(1.0, min(points, most))), reach)
 
 
 def _walked(
@@ -200,15 +203,19 @@ def _walked(
     """SGLD draws of `z` (chain, draw, coordinate), or None and the reason; the number of gradients is bounded."""
     density = target.exact
     steps = min(_STEPS, _GRADIENT_STEPS / len(density.hypothesis.data.grid.time) * target.points / chains)
-    thinning = 2 if draws * 2 + 4 <= steps else 1
-    longest = max([1.0, *(t for t in (1.5, 2.0, 3.0, 4.0) if (4 * t + thinning * draws) * t <= steps)])
-    if steepness > 2 * longest or thinning * draws + 4 > 2 * steps:
-        steep = f"in places {steepness:.0f} times as steep"
-        return None, f"its shape is far from normal ({steep}), and SGLD would take too long"
+    each = steps / (draws + 8)  # a draw, with the burn-in
+    # a direction r standard deviations of the mode wide takes r² steps, as long as the steepest one allows
+    wide = torch.linalg.svdvals(torch.linalg.solve(mode.scale[0], target.surrogate.spread)).max() / _WIDER
+    apart = max(1.0, float(wide) ** 2)
+    if chains * draws * min(1.0, each / (steepness * apart)) < _FEWEST:
+        shape = f"in places {steepness:.0f} times as steep, {float(wide):.1f} times as wide"
+        return None, f"its shape is far from normal ({shape}), and SGLD would take too long"
+    longest = min(max(1.0, steepness), max(1.0, each))
+    thinning = max(1, round(min(apart, each / longest)))
     settings = SamplerSettings(
         chains=chains,
         draws=draws,
-        burn_in=4,
+        burn_in=2 + 2 * thinning,
         thinning=thinning,
         step=STEP,
         spread=1.0,

@@ -76,7 +76,10 @@ class Search:
         if self.alone and "~linear" in self.effects:
             ways = [self._put(fit(self._add(best, "~linear", s, None, 10), 6)) for s in EFFECTS["~linear"].starts[1:]]
             free = max(ways, key=lambda h: h.score)
-            best = free if free.score > best.score + 10 else best
+            if free.score > best.score:  # the car's own dynamics, without a name
+                self.visited.clear()
+                self.base, free.base = free, free
+                best = self._put(free)
         best = self.extended(best)
         if "gear_shift" in self.effects and "gear_shift" not in best.effects and not self._ended():
             # interruptions may show once other effects are in
@@ -309,7 +312,8 @@ def promises(h: Hypothesis, candidates: Sequence[EngineEffect]) -> list[Promise]
                     p[INDEX[c.name]] = x
                 if kept:  # a lag hides most of a delay
                     p[0] = max(p[0] - 0.8 * start[0], min(p[0], 0.06))
-                rows = h.rows(p)
+                # the simulator runs a user's own effect only where a hypothesis has it
+                rows = (h if e.kind is None else h.with_effect(e.name, start)).rows(p)
                 change = h.data.transform(rows) - h.predicted
                 whitened = whiten(h.data, h.covariance, change)
                 if not kept:

@@ -44,25 +44,22 @@ class Surrogate:
     def of(cls, density: HypothesisDensity, x: FloatArray) -> Surrogate:
         """Fitted by least squares to responses at draws `x` (draw, coordinate) of roughly the posterior."""
         h, data = density.hypothesis, density.hypothesis.data
-        centre = x.mean(0)
-        scale = np.linalg.cholesky(np.cov(x.T).reshape(len(centre), -1) + 1e-18 * np.eye(len(centre)))
-        terms = _terms(torch.as_tensor(np.linalg.solve(scale, (x - centre).T).T)).numpy()
-        weight = np.linalg.pinv(terms)
+        draws = torch.as_tensor(x)
+        centre, scale, z = draws.mean(0), _root(draws), density.unconstrain(draws)
+        terms = _terms(torch.linalg.solve_triangular(scale, (draws - centre).mT, upper=False).mT)
+        weight = torch.linalg.pinv(terms).numpy()
         values, at = h.values.copy(), [INDEX[n] for n in density.names]
         columns = np.zeros((len(weight), *data.measured.shape))
         for k, own in enumerate(x):
             values[at] = own
             columns += np.multiply.outer(weight[:, k], data.measured - h.response(values))
-        gram = np.empty((data.band_count, len(pairs(data)), len(weight), len(weight)))
-        for b, (first, end) in enumerate(pairwise(data.band_edges.tolist())):
-            flat = columns[..., first:end].reshape(len(weight), data.channel_count, -1)
-            for p, (i, j) in enumerate(pairs(data)):
+        gram = np.empty((len(weight), data.band_count, len(pairs(data)), len(weight)))
+        for band, (begin, end) in enumerate(pairwise(data.band_edges.tolist())):
+            flat = columns[..., begin:end].reshape(len(weight), data.channel_count, -1)
+            for pair, (i, j) in enumerate(pairs(data)):
                 product = flat[:, i] @ flat[:, j].T
-                gram[b, p] = 0.5 * (product + product.T)
-        first = np.ascontiguousarray(np.moveaxis(gram, -1, 0))
-        z = density.unconstrain(torch.as_tensor(x))
-        tables = (torch.as_tensor(table) for table in (centre, scale, first))
-        return cls(density, *tables, z.mean(0), torch.linalg.cholesky(z.T.cov().reshape(len(centre), -1)))
+                gram[:, band, pair] = 0.5 * (product + product.T)
+        return cls(density, centre, scale, torch.as_tensor(gram), z.mean(0), _root(z))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -74,11 +71,10 @@ class Surrogate:
     def constrain(self, z: Tensor) -> Tensor:
         return self.density.constrain(z)
 
-    def covers(self, z: Tensor) -> Tensor:
-        """Whether `z` (..., coordinate) is where the surrogate was fitted: (...)."""
+    def distance(self, z: Tensor) -> Tensor:
+        """Of `z` (..., coordinate) from the middle of the fitted draws, in their standard deviations: (...)."""
         away = (z - self.middle).unsqueeze(-1)
-        w = torch.linalg.solve_triangular(self.spread, away, upper=False).squeeze(-1)
-        return w.square().sum(-1) <= reach(z.shape[-1]) ** 2
+        return torch.linalg.solve_triangular(self.spread, away, upper=False).squeeze(-1).norm(dim=-1)
 
     def log_prob(self, z: Tensor) -> Tensor:
         """Log density (..., 1) of `z` (..., 1, coordinate). Differentiable once."""
@@ -110,9 +106,12 @@ class Surrogate:
         return (likelihood + rest).detach(), score
 
 
-def reach(size: int) -> float:
-    """Distance up to which a surrogate is used, in standard deviations of the draws that it was fitted to."""
-    return (size + 2 * (2 * size) ** 0.5) ** 0.5
+def _root(draws: Tensor) -> Tensor:
+    """A triangular root of the covariance of `draws` (draw, coordinate), also where many are the same."""
+    covariance = draws.T.cov().reshape(draws.shape[1], -1)
+    return torch.linalg.cholesky(
+        covariance + 1e-6 * torch.diag(covariance.diagonal()) + 1e-24 * torch.eye(len(covariance))
+    )
 
 
 def terms_of(count: int) -> int:
@@ -129,12 +128,14 @@ def _terms(w: Tensor) -> Tensor:
 class Corrected:
     """The `exact` density with minibatch estimates from the `surrogate`, corrected at one step in `points`.
 
-    All chains are corrected at the same step, as one call for many is cheap.
+    All chains are corrected at the same step, as one call for many is cheap. `reach`: the surrogate's `distance` up to
+    which its gradients are used.
     """
 
     exact: HypothesisDensity
     surrogate: Surrogate
     points: int
+    reach: float
 
     windows = 1
 
@@ -160,7 +161,7 @@ class Corrected:
     def log_prob_minibatch(self, z: Tensor, index: Tensor) -> Tensor:
         """Log density of `z` (..., 1, coordinate), its gradient unbiased over uniform `index` in 0 ... points - 1."""
         flat = z.reshape(-1, z.shape[-1])
-        far = ~self.surrogate.covers(flat.detach())  # NaN counts as far
+        far = ~(self.surrogate.distance(flat.detach()) <= self.reach)  # NaN counts as far
         share = torch.where(far, 1.0, float((index == 0).sum()) * self.points / len(index))
         value = torch.where(far, 0.0, self.surrogate.log_prob(flat))
         chosen = share.nonzero().squeeze(-1)

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import digamma
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.engine.drive_data import DriveData
@@ -30,6 +31,7 @@ _LAGS_S = (0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
 _SMOOTH_S = 0.5  # of the speed: little of the noise of the moment is in it
 _LINEAR, _MAP, _TIME = range(3)  # sets of columns, each with those before it
 _PRIOR_SD = np.geomspace(0.001, 3.0, 12)  # of a coefficient [m/s²]
+_POOLED = 200  # coefficients a channel that tell a band's noise: a free band swallows what few coefficients show
 _STEPS = 4  # alternations between coefficients and noise
 _DRAWS = 200  # of the posterior
 _LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
@@ -144,11 +146,33 @@ class _Taught(NamedTuple):
         return mean, draws
 
     def _noise(self, mean: FloatArray) -> FloatArray:
-        """Covariance (band, channel, channel) of what coefficients (column,) leave."""
+        """Covariance (band, channel, channel) of what coefficients (column,) leave, smooth over bands."""
         mixed = self.mixed @ mean
         S = self.residual - mixed - mixed.transpose(0, 2, 1) + (self.columns @ mean) @ mean
-        S = S / self.data.band_size[:, None, None]
-        return S + _LEAST * np.trace(S, axis1=1, axis2=2)[:, None, None] * np.eye(S.shape[1])
+        return _smooth(S / self.data.band_size[:, None, None], self.data.band_size, self.data.frequency[self.middles])
+
+    @property
+    def middles(self) -> IntArray:
+        """Middle bin (band,) of each band."""
+        return (self.data.band_edges[:-1] + self.data.band_edges[1:]) // 2
+
+
+def _smooth(S: FloatArray, counts: IntArray, frequency: FloatArray) -> FloatArray:
+    """Covariances (band, channel, channel) over as many neighbours as have `_POOLED` coefficients together: variances
+    by a local power of the frequency (band,), correlations by their mean."""
+    S = S + _LEAST * np.trace(S, axis1=1, axis2=2)[:, None, None] * np.eye(S.shape[1])
+    sd = np.sqrt(np.diagonal(S, axis1=1, axis2=2))
+    correlation = S / (sd[:, :, None] * sd[:, None, :])
+    level = 2 * np.log(sd) - (digamma(counts / 2) - np.log(counts / 2))[:, None]  # of a variance's logarithm
+    x, at, out = np.log(frequency), np.arange(len(counts)), np.empty_like(S)
+    for b in at:
+        near = np.abs(at - b) <= next((w for w in at if counts[np.abs(at - b) <= w].sum() >= _POOLED), len(at))
+        weights = counts[near] / counts[near].sum()
+        away = x[near] - weights @ x[near]
+        slope = (weights * away) @ level[near] / max(float(weights @ away**2), 1e-12)
+        own = np.exp(0.5 * (weights @ level[near] + slope * (x[b] - weights @ x[near])))
+        out[b] = own[:, None] * own * np.tensordot(weights, correlation[near], 1)
+    return out
 
 
 # what is shown -------------------------------------------------------------------------------------------------------

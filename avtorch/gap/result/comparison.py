@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 SimulatorChange = Literal["closer", "farther", "inconclusive"]
 Explanation = Literal["lag and gain", "not lag and gain", "not distinguishable"]
 
+_SURE = 0.75  # three to one: the probability from which on an explanation stands
+
 
 @dataclass(frozen=True)
 class Change:
@@ -32,12 +34,11 @@ class Change:
 
 @dataclass(frozen=True)
 class DeadTimeTest:
-    """Whether lag and gain explain a change better than a change of dead time.
+    """Whether lag and gain explain a change better than a change of dead time, by one model of both sets of drives.
 
-    Dead time [s] `before`, `after` and their `difference`, where every drive is fitted with one; a value below 0 is
-    noise. `p_lag_gain`: p-value of that difference if only lag and gain have changed; `p_dead_time`: p-value of the
-    difference of lag and gain, fitted with dead time, if only the dead time has changed. An explanation with a p-value
-    below `level` is rejected; lag and gain, which are what `compare` reports, only with less than a quarter of that.
+    Dead time [s] `before`, `after` and their `difference`, where lag and gain may have changed as well. `p_lag_gain`:
+    probability that lag or gain has changed and the dead time has not; `p_dead_time`: that the dead time alone has;
+    the rest: both have.
     """
 
     before: Quantity
@@ -45,15 +46,14 @@ class DeadTimeTest:
     difference: Quantity
     p_lag_gain: float
     p_dead_time: float
-    level: float
 
     @property
     def explanation(self) -> Explanation:
-        """`"lag and gain"` where they explain the change and a dead time does not, `"not lag and gain"` where they do
-        not explain it, `"not distinguishable"` where both explain it."""
-        if self.p_lag_gain < 0.25 * self.level:
+        """`"lag and gain"` where they alone have changed with a probability of 0.75, `"not lag and gain"` where they
+        have not, `"not distinguishable"` otherwise."""
+        if self.p_lag_gain < 1 - _SURE:
             return "not lag and gain"
-        return "lag and gain" if self.p_dead_time < self.level else "not distinguishable"
+        return "lag and gain" if self.p_lag_gain > _SURE else "not distinguishable"
 
     def to_dict(self) -> dict[str, Any]:
         delays = {"before": self.before, "after": self.after, "difference": self.difference}

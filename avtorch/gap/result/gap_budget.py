@@ -29,6 +29,7 @@ from avtorch.io import Log
 CHANCE = ("gust", "outliers", "command_hold")
 """Causes that chance decides: no free run foretells them."""
 _RESAMPLES = 400
+_NOTHING = 1e-3  # of the energy before, below which free runs show no gap
 _NO_GAP = 0.1  # share of the error before that is within the floor: nothing to close (DIAGNOSIS)
 
 
@@ -173,9 +174,11 @@ def _resampled(energy: FloatArray, floor: FloatArray, seed: int) -> FloatArray:
     pick[0] = np.arange(blocks)
     levels = np.moveaxis(energy[:, pick].mean(-1), 0, 1)  # draw, model
     bottom = np.minimum(floor[pick].mean(-1), levels[:, -1])
-    gap = np.maximum(levels[:, 0] - bottom, 1e-9 * levels[:, 0])
-    taken = -np.diff(levels, axis=1) / gap[:, None]
-    return np.column_stack([taken, (levels[:, -1] - bottom) / gap])
+    parts = np.column_stack([np.maximum(-np.diff(levels, axis=1), 0.0), levels[:, -1] - bottom])
+    total = parts.sum(1, keepdims=True)
+    alike = np.full_like(parts, 1.0 / max(parts.shape[1] - 1, 1))  # where runs show no gap, shares say nothing
+    alike[:, -1] = 0.0 if parts.shape[1] > 1 else 1.0
+    return np.where(total > _NOTHING * levels[:, :1], parts / np.maximum(total, 1e-300), alike)
 
 
 def _quantity(draws: FloatArray) -> Quantity:

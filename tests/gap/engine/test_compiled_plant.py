@@ -28,7 +28,7 @@ VALUES = {
     "gain_change": (-0.25,),
     "gain_change/drift": (0.3,),
     "gear_shift": (0.7, 0.31),
-    "driveline_oscillation": (0.2, -0.1, 2.3),
+    "driveline_oscillation": (0.2, 2.3),
     "aerodynamic_drag": (4e-4, 2.0),
     "constant_resistance": (0.12,),
     "low_speed_creep": (0.4,),

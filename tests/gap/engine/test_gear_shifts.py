@@ -28,6 +28,7 @@ from avtorch.gap.engine.gear_shifts import (
     upshift_times,
 )
 from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.priors import SHIFT_NATS
 from avtorch.gap.simulator.effect_context import EffectContext
 from tests.bars import log_odds
 
@@ -154,7 +155,7 @@ def test_gains_are_those_of_the_simulated_response(fresh_seed: int) -> None:
         size = inner(change, change) - float(across @ np.linalg.solve(N, across))
         pulses = likelihood.pulses(likelihood.upshifts(level, h["shift_hysteresis"]), 0.35)
         # log L along the response is off by less than a tenth of the noise that it has anyhow
-        assert abs(likelihood.gain(likelihood.score, pulses) - slope) < 0.1 * np.sqrt(size)
+        assert abs(likelihood.gain(likelihood.score, pulses) - slope) <= 0.1 * np.sqrt(size)
         sizes += likelihood.size(pulses).own
         expected += size
     # the information is the mean over the places of pulses in frames: 25 % each, of some 20 upshifts
@@ -197,32 +198,29 @@ def test_a_car_without_gears_has_no_shift_speeds(rotating_seed: int) -> None:
     assert len(speeds) <= 2
 
 
-def _passed(h: Hypothesis, speeds: tuple[float, ...] | FloatArray, hysteresis: float) -> list[int]:
-    """How many upshifts through each of `speeds` are scored; less where there are none."""
-    data = h.data
-    scored = data.time[data.warm_rows + data.frame_rows // 2]
-    counts = [
-        int((upshift_times(data.time, data.smooth_speed, data.starts, float(s), hysteresis) > scored).sum())
-        for s in speeds
-    ]
-    return [n for n in counts if n]
-
-
 @pytest.mark.statistical
-@pytest.mark.parametrize("start", [(5.6, 9.5, 12.1), SPEEDS], ids=["wrong", "right"])
-def test_refinement_finds_the_speeds_and_when_gears_rearm(rotating_seed: int, start: tuple[float, ...]) -> None:
+@pytest.mark.parametrize("off", [None, (0.2, -0.2, 0.2)], ids=["as found", "off"])
+def test_refinement_finds_the_speeds_and_when_gears_rearm(
+    rotating_seed: int, off: tuple[float, float, float] | None
+) -> None:
     rearm = 2.0
     h = _fitted(_log(np.random.default_rng(rotating_seed), rearm=rearm))
-    begun = _with_shifts(h, np.array(start))
+    begun = _with_shifts(h, shift_speeds(h)[0] if off is None else np.array(SPEEDS) + off)
     found = refined_shift_speeds(begun)
     assert found.log_likelihood > begun.log_likelihood
-    passed = [s for s in SPEEDS if _passed(h, (s,), rearm)]
-    near = np.abs(np.array(passed)[:, None] - found.shift_speeds).min(1)
+    # as good as a fit from the truth, but for a speed or two that the car hardly passes and that are not worth their
+    # price, and for an optimum a little beside
+    truth = h.copy()
+    truth.shift_speeds = np.array(SPEEDS)
+    truth["shift_hysteresis"] = rearm
+    truth = fit_with_speeds(truth.with_effect("gear_shift", (DEPTH, DURATION)), 8)
+    assert found.log_likelihood > truth.log_likelihood - 2 * SHIFT_NATS - 0.02 * (
+        truth.log_likelihood - h.log_likelihood
+    )
     # an interruption of 0.4 s is placed to some hundredths of a second, at 1 m/s²
-    assert near.max() < 0.08
+    assert np.abs(found.shift_speeds[:, None] - SPEEDS).min(1).max() < 0.08
     assert found["shift_depth"] == pytest.approx(DEPTH, abs=0.08)
     assert found["shift_duration"] == pytest.approx(DURATION, abs=0.05)
-    assert _passed(h, found.shift_speeds, found["shift_hysteresis"]) == _passed(h, tuple(passed), rearm)
 
 
 @pytest.mark.statistical
