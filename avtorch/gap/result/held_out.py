@@ -108,7 +108,7 @@ def held_out_errors(chain: Sequence[Hypothesis]) -> HeldOut | None:
     scored = [_scores(data, blocks, e, x.residuals, x.residuals) for x, e in zip(fitted, stitched, strict=True)]
     beside, foretold, possible = [], [], []
     for x, errors in ((fitted[-1], stitched[-1]), (fitted[0], stitched[0])):
-        found = BlackBox.of(x.hypothesis).predict(x.residuals, blocks)
+        found = BlackBox.of(x.hypothesis).predict(x.residuals, errors, blocks)
         possible.append(found.possible)
         foretold.append(blocks.stitched(found.readings))
         beside.append(_scores(data, blocks, errors - foretold[-1], x.residuals, x.residuals - found.coefficients))
@@ -216,8 +216,8 @@ def _without_chance(h: Hypothesis) -> Hypothesis:
 
 
 def _sized(h: Hypothesis) -> list[str]:
-    """Effects that a free run shows."""
-    return [e for e in h.effects if e != _RANDOM]
+    """Effects with a name that a free run shows."""
+    return [e for e in h.effects if e != _RANDOM and not e.startswith("~")]
 
 
 def _key(h: Hypothesis, without: str | None = None) -> frozenset[tuple[str, bool]]:
