@@ -19,7 +19,7 @@ from avtorch.gap.answer.given_dead_time import given_dead_time
 from avtorch.gap.answer.location import RowAttribution, localise
 from avtorch.gap.answer.scope import Scope
 from avtorch.gap.black_box import BlackBoxSimulator
-from avtorch.gap.engine.average import Weight
+from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.coordinates import EFFECTS, adopt, base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.inference import RANDOM, Inference, infer
@@ -33,6 +33,7 @@ from avtorch.gap.result.gap_budget import budget_of, shrinkage_of
 from avtorch.gap.result.gap_size import Simulated, gap_size
 from avtorch.gap.result.held_out import held_out_errors, nested
 from avtorch.gap.result.hypotheses import best_weight, candidates_of, first_onset, verdict, verdict_names
+from avtorch.gap.result.own_random import own_random, renamed
 from avtorch.gap.result.parameters import ParameterPosterior, base_quantities
 from avtorch.gap.result.predictive_model import noise_of, predictive_models
 from avtorch.gap.result.traces import Traces
@@ -126,24 +127,27 @@ def diagnose(
     each, notes = [log for log, _ in read], dict.fromkeys(note for _, note in read if note)
     data = DriveData.of(each)
     shown = [kind for kind in kinds if is_observable(kind, data.channels)]
+    random = own_random(shown)
     inference = infer(
         data,
         baseline=base,
-        effects=tried_names(shown),
+        effects=(*tried_names(shown), *(each.like for each in random)),
         most=None if pairs else 1,
         prior=checked_prior(prior, kinds),
         stop=deadline(budget_s),
         progress=told,
     )
-    average, none = inference.average, inference.base
+    average = renamed(inference.average, random, {kind.name for kind in shown})
+    none = inference.base
     rows = CountedRows.of(inference.data, tuple(each))
     names = verdict_names(average)
     weight = best_weight(average, names)
     named = names[0] not in ("none", "unknown")
-    chosen = _posterior(weight, posterior, seed) if named else ParameterPosterior(weight, seed=seed)
-    candidates, posteriors = candidates_of(inference, each, kinds, chosen if named else None)
+    draws = sample(weight.examined.hypothesis, seed=seed) if named and posterior == "sgld" else None
+    chosen = ParameterPosterior(weight, draws, seed, random)
+    candidates, posteriors = candidates_of(average, each, kinds, chosen if named else None, random)
     # an unknown cause shows where the best known ones would act
-    top = weight if named or names == ("none",) else _likeliest(inference)
+    top = weight if named or names == ("none",) else _likeliest(average)
     best = top.examined.hypothesis
     if told is not None:
         told("held-out blocks", 0, 1)
@@ -152,7 +156,16 @@ def diagnose(
         held = held_out_errors(nested(none, weight.examined.hypothesis, inference.search.visited.values()))
     budget = None
     if held is not None:
-        budget = budget_of(average, chosen, held, each, names=names, material=material, seed=seed)
+        budget = budget_of(
+            average,
+            chosen,
+            held,
+            each,
+            names=names,
+            material=material,
+            seed=seed,
+            chance=[kind.name for kind in shown if kind.random],
+        )
     if budget is not None:
         names = budget.verdict
     complete = inference.search.complete
@@ -229,8 +242,7 @@ def gap_budget(
         >>> gap_budget(log, effects=["constant_resistance", "dead_time"]).names
         ('constant_resistance',)
     """
-    settings = {"baseline": baseline, "effects": effects, "material": material, "seed": seed}
-    found = diagnose(logs, **settings, progress=progress)
+    found = diagnose(logs, baseline=baseline, effects=effects, material=material, seed=seed, progress=progress)
     if found.budget is None:
         raise InputError(f"{found.log.name}: {found.log.seconds:.0f} s are too short to hold out five blocks of 4 s")
     return found.budget
@@ -238,7 +250,8 @@ def gap_budget(
 
 def tried_names(kinds: Sequence[type[Effect]]) -> tuple[str, ...]:
     """Names by which the engine knows these effects, its variants of them among them."""
-    own = {adopt(kind).name if not kind.random and kind.name not in RANDOM else kind.name for kind in kinds}
+    known = [kind for kind in kinds if not kind.random or kind.name in (*RANDOM, "command_hold")]
+    own = {kind.name if kind.random or kind.name in RANDOM else adopt(kind).name for kind in known}
     variants = [e for e in EFFECTS if base_name(e) in own or (e.startswith("~"))]
     return tuple(dict.fromkeys([*own, *variants]))
 
@@ -262,16 +275,10 @@ def deadline(budget_s: float | None) -> Callable[[], bool] | None:
     return lambda: time.monotonic() > end
 
 
-def _posterior(weight: Weight, method: str, seed: int) -> ParameterPosterior:
-    if method == "laplace":
-        return ParameterPosterior(weight, seed=seed)
-    return ParameterPosterior(weight, sample(weight.examined.hypothesis, seed=seed), seed=seed)
-
-
-def _likeliest(inference: Inference) -> Weight:
+def _likeliest(average: ModelAverage) -> Weight:
     """The strongest weight of a label with names."""
-    named = [w for label, w in inference.average.best.items() if label not in ("none", "unknown")]
-    return max(named or inference.average.best.values(), key=lambda w: w.log_weight)
+    named = [w for label, w in average.best.items() if label not in ("none", "unknown")]
+    return max(named or average.best.values(), key=lambda w: w.log_weight)
 
 
 def _base_weight(inference: Inference) -> Weight:

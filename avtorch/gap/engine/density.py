@@ -97,7 +97,7 @@ class HypothesisDensity:
     def constrain(self, z: Tensor) -> Tensor:
         """Coordinates of `z`, within their limits."""
         low, span, s = self._map
-        x = torch.where(self._free, z, low + s * (softplus(z / s) - softplus((z - span) / s)))
+        x = torch.where(self._free, z, low + s * (_softplus(z / s) - _softplus((z - span) / s)))
         return x - x @ self._lateness
 
     def unconstrain(self, x: Tensor) -> Tensor:
@@ -234,6 +234,10 @@ def log_prior(h: Hypothesis, names: Sequence[str], x: Tensor) -> Tensor:
             square = sum(z * z for z in sized)
             total = total + (-1 / torch.as_tensor(square).clamp_min(1e-9)).clamp_min(_IMPOSSIBLE)
     return total
+
+
+def _softplus(x: Tensor) -> Tensor:
+    return softplus(x, threshold=40.0)  # linear only where doubles cannot tell
 
 
 def _student(z: Tensor) -> Tensor:

@@ -117,7 +117,7 @@ def truncated_normal(
         for k, own in enumerate(np.sqrt(np.diag(precision))):
             centre = x[:, k] - (x - mean) @ precision[k] / own**2
             a, b = own * (low[k] - centre), own * (high[k] - centre)
-            side = np.where(a + b > 0, -1.0, 1.0)  # in the lower tail, where probabilities keep their digits
+            side = np.where(a > -b, -1.0, 1.0)  # in the lower tail, where probabilities keep their digits
             a, b = np.where(side < 0, -b, a), np.where(side < 0, -a, b)
             share = ndtr(a) + rng.random(count) * (ndtr(b) - ndtr(a))
             x[:, k] = np.clip(centre + side * np.clip(ndtri(share), a, b) / own, low[k], high[k])

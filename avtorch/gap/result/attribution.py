@@ -1,5 +1,5 @@
-"""What a hypothesis changes, row by row, in nats: the transform is orthonormal, so that nats of coefficients are nats of
-rows.
+"""What a hypothesis changes, row by row, in nats: the transform is orthonormal, so that nats of coefficients are nats
+of rows.
 
 In units of the noise, half the square of the change that a hypothesis makes to the prediction is what it is expected to
 gain; the difference of the squared residuals is what it did gain. Both are spread over rows by the transform's adjoint.

@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import digamma
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.engine.drive_data import DriveData
@@ -31,7 +30,7 @@ _LAGS_S = (0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
 _SMOOTH_S = 0.5  # of the speed: little of the noise of the moment is in it
 _LINEAR, _MAP, _TIME = range(3)  # sets of columns, each with those before it
 _PRIOR_SD = np.geomspace(0.001, 3.0, 12)  # of a coefficient [m/s²]
-_POOLED = 200  # coefficients a channel that tell a band's noise: a free band swallows what few coefficients show
+_POOLED = (1, 200)  # coefficients a channel that tell a band's noise: free bands swallow what few coefficients show
 _STEPS = 4  # alternations between coefficients and noise
 _DRAWS = 200  # of the posterior
 _LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
@@ -70,28 +69,37 @@ class BlackBox:
         shown = np.stack([_shown(h, x) for x in forces] + [_shown(h, None, x) for x in faults])
         return cls(h, forces, faults, kind, shown, np.stack([h.data.transform(compared(h.data, x)) for x in shown]))
 
-    def predict(self, residuals: FloatArray, blocks: Blocks) -> Predicted:
+    def predict(self, residuals: FloatArray, errors: FloatArray, blocks: Blocks) -> Predicted:
         """What the columns foretell of each fold's blocks, taught by the `residuals` (fold, channel, frame, bin) of the
-        other blocks alone."""
+        other blocks alone. `errors` (channel, row): of readings, each block's by the fit without it."""
         h, X = self.hypothesis, self.coefficients
         rng = np.random.default_rng(0)
         normal, uniform = rng.standard_normal((_DRAWS, len(X))), rng.random(_DRAWS)
-        runs = blocks.free_runs(h.data, self.readings)
+        runs, left = blocks.free_runs(h.data, self.readings), blocks.free_runs(h.data, errors)
+        before = blocks.sums(left**2).sum(1) + 1e-12
         alike = [(blocks.taught == pattern[:, None]).all(0) for pattern in np.unique(blocks.taught, axis=1).T]
         products = [band_products(h.data, X[:, :, frames]) for frames in alike]
-        rows, coefficients = [], []
+        means = np.zeros((1 + len(_POOLED), len(blocks.taught), len(X)))  # the first foretells nothing
         possible = np.zeros((_DRAWS, h.data.channel_count, len(blocks.rows)))
+        gains = np.zeros(means.shape[:2])
         for k, frames in enumerate(blocks.taught):
             own = np.sum([x for x, group in zip(products, alike, strict=True) if frames[group].all()], axis=0)
             taught = _Taught.of(h.data.only(frames), own, X[:, :, frames], residuals[k][:, frames])
-            mean, draws = taught.posterior(self.kind, normal, uniform)
-            split = len(self.forces)
-            rows.append(_shown(h, mean[:split] @ self.forces, mean[split:] @ self.faults))
-            coefficients.append(h.data.transform(compared(h.data, rows[-1])))
+            draws = means[0]
+            for i, least in enumerate(_POOLED, 1):
+                means[i, k], draws = taught.posterior(self.kind, least, normal, uniform)
             for b in np.flatnonzero(blocks.fold == k):
                 for c in range(runs.shape[1]):
                     part = runs[:, c, blocks.rows[b]]
-                    possible[:, c, b] = ((draws @ (part @ part.T)) * draws).sum(1)
+                    gram, match = part @ part.T, part @ left[c, blocks.rows[b]]
+                    possible[:, c, b] = ((draws @ gram) * draws).sum(1)
+                    gains[:, k] += (2 * means[:, k] @ match - ((means[:, k] @ gram) * means[:, k]).sum(1)) / before[c]
+        others = gains.sum(1, keepdims=True) - gains
+        rows, split = [], len(self.forces)
+        for k, way in enumerate(others.argmax(0)):
+            beta = means[way, k]
+            rows.append(_shown(h, beta[:split] @ self.forces, beta[split:] @ self.faults))
+        coefficients = [h.data.transform(compared(h.data, x)) for x in rows]
         return Predicted(np.stack(rows), np.stack(coefficients), possible)
 
 
@@ -116,13 +124,15 @@ class _Taught(NamedTuple):
             np.moveaxis(np.add.reduceat(squares, edges, axis=-1), -1, 0),
         )
 
-    def posterior(self, kind: IntArray, normal: FloatArray, uniform: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def posterior(
+        self, kind: IntArray, least: int, normal: FloatArray, uniform: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Mean (column,) and draws (draw, column) of the coefficients, from standard normal (draw, column) and uniform
         (draw,) numbers."""
         variance = _PRIOR_SD**2
-        mean = np.zeros(len(kind))
+        mean, pooling = np.zeros(len(kind)), _pooling(self.data.band_size, least)
         for _ in range(_STEPS):
-            weights = np.linalg.inv(self._noise(mean))
+            weights = np.linalg.inv(self._noise(mean, pooling))
             gram, match = np.tensordot(weights, self.columns, 3), np.tensordot(weights, self.mixed, 3)
             axes, logs, means = [], [], []
             for last in (_LINEAR, _MAP, _TIME):
@@ -145,33 +155,20 @@ class _Taught(NamedTuple):
             draws[i] += whole @ (np.sqrt(taken[at % len(variance)]) * normal[i, : whole.shape[1]])
         return mean, draws
 
-    def _noise(self, mean: FloatArray) -> FloatArray:
-        """Covariance (band, channel, channel) of what coefficients (column,) leave, smooth over bands."""
+    def _noise(self, mean: FloatArray, pooling: FloatArray) -> FloatArray:
+        """Covariance (band, channel, channel) of what coefficients (column,) leave, pooled over bands."""
         mixed = self.mixed @ mean
         S = self.residual - mixed - mixed.transpose(0, 2, 1) + (self.columns @ mean) @ mean
-        return _smooth(S / self.data.band_size[:, None, None], self.data.band_size, self.data.frequency[self.middles])
-
-    @property
-    def middles(self) -> IntArray:
-        """Middle bin (band,) of each band."""
-        return (self.data.band_edges[:-1] + self.data.band_edges[1:]) // 2
+        S = np.tensordot(pooling, S, 1)
+        return S + _LEAST * np.trace(S, axis1=1, axis2=2)[:, None, None] * np.eye(S.shape[1])
 
 
-def _smooth(S: FloatArray, counts: IntArray, frequency: FloatArray) -> FloatArray:
-    """Covariances (band, channel, channel) over as many neighbours as have `_POOLED` coefficients together: variances
-    by a local power of the frequency (band,), correlations by their mean."""
-    S = S + _LEAST * np.trace(S, axis1=1, axis2=2)[:, None, None] * np.eye(S.shape[1])
-    sd = np.sqrt(np.diagonal(S, axis1=1, axis2=2))
-    correlation = S / (sd[:, :, None] * sd[:, None, :])
-    level = 2 * np.log(sd) - (digamma(counts / 2) - np.log(counts / 2))[:, None]  # of a variance's logarithm
-    x, at, out = np.log(frequency), np.arange(len(counts)), np.empty_like(S)
+def _pooling(counts: IntArray, least: int) -> FloatArray:
+    """(band, band): sums over bands to means over as many neighbours as have `least` coefficients together."""
+    out, at = np.zeros((len(counts), len(counts))), np.arange(len(counts))
     for b in at:
-        near = np.abs(at - b) <= next((w for w in at if counts[np.abs(at - b) <= w].sum() >= _POOLED), len(at))
-        weights = counts[near] / counts[near].sum()
-        away = x[near] - weights @ x[near]
-        slope = (weights * away) @ level[near] / max(float(weights @ away**2), 1e-12)
-        own = np.exp(0.5 * (weights @ level[near] + slope * (x[b] - weights @ x[near])))
-        out[b] = own[:, None] * own * np.tensordot(weights, correlation[near], 1)
+        near = np.abs(at - b) <= next((w for w in at if counts[np.abs(at - b) <= w].sum() >= least), len(at))
+        out[b, near] = 1 / counts[near].sum()
     return out
 
 

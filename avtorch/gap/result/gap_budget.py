@@ -42,11 +42,13 @@ def budget_of(
     names: Sequence[str],
     material: float = MATERIAL,
     seed: int = 0,
+    chance: Sequence[str] = (),
 ) -> Budget:
     """The budget of the causes `names` (or `none`, `unknown`); `posterior`: of the weight that has them all.
 
-    `material`: share of the gap from which what is unexplained is said to matter, where nothing is named by what the
-    evidence says: with `unknown` it does, with `none` it does not.
+    `chance`: names of a user's causes that chance decides. `material`: share of the gap from which what is
+    unexplained is said to matter, where nothing is named by what the evidence says: with `unknown` it does, with
+    `none` it does not.
     """
     energy, floor = _energies(held)
     draws = _resampled(energy, floor, seed)
@@ -57,7 +59,7 @@ def budget_of(
     steps = dict(zip(held.names, pairwise(energy.mean(1)), strict=True))
     bottom = float(floor.mean())
     for name in names:
-        if name in CHANCE or name in ("none", "unknown"):
+        if name in CHANCE or name in chance or name in ("none", "unknown"):
             continue
         # a road is in the noise's spectrum: it takes off what the black box knows of the place
         share = shares.get(name, np.zeros(len(draws)))
@@ -102,7 +104,7 @@ def budget_of(
         unexplained=Unexplained(unnamed, matters, average.probabilities["unknown"] if not parts else beyond),
         baseline={key: held.chain[0][key] for key in ("T_L", "K_L")},
         repaired=posterior.moved(),
-        chance=_chance(average, posterior, names),
+        chance=_chance(average, posterior, names, (*CHANCE, *chance)),
         material=material,
         horizon_s=held.horizon_s,
         by_drives=held.blocks.by_drives,
@@ -225,10 +227,12 @@ def _aliases(average: ModelAverage, name: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(out))
 
 
-def _chance(average: ModelAverage, posterior: ParameterPosterior, names: Sequence[str]) -> tuple[ChancePart, ...]:
+def _chance(
+    average: ModelAverage, posterior: ParameterPosterior, names: Sequence[str], chance: Sequence[str]
+) -> tuple[ChancePart, ...]:
     own: Mapping[str, Mapping[str, Quantity]] = posterior.by_effect()
     out = []
-    for name in CHANCE:
+    for name in chance:
         if name not in names or average.marginal(name) < LIKELY:
             continue
         quantities = dict(own.get(name, {}))

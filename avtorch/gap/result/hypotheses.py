@@ -12,9 +12,9 @@ from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.coordinates import base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.inference import Inference
 from avtorch.gap.engine.outliers import rate_onset
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.own_random import OwnRandom
 from avtorch.gap.result.parameters import ParameterPosterior
 from avtorch.gap.simulator.effect import Effect
 from avtorch.io import Log
@@ -111,10 +111,13 @@ def why(average: ModelAverage, names: Sequence[str], known: str) -> str:
 
 
 def candidates_of(
-    inference: Inference, logs: Sequence[Log], kinds: Sequence[type[Effect]], posterior: ParameterPosterior | None
+    average: ModelAverage,
+    logs: Sequence[Log],
+    kinds: Sequence[type[Effect]],
+    posterior: ParameterPosterior | None,
+    random: Sequence[OwnRandom] = (),
 ) -> tuple[list[Candidate], dict[str, ParameterPosterior]]:
     """Hypotheses of the answer, and the posteriors of their parameters by name; `posterior`: that of the verdict."""
-    average = inference.average
     none = average.best["none"].evidence if "none" in average.best else 0.0
     out: list[Candidate] = []
     posteriors: dict[str, ParameterPosterior] = {}
@@ -123,7 +126,11 @@ def candidates_of(
         if weight is None or label == "unknown":
             out.append(Candidate(label, p))
             continue
-        own = posterior if posterior is not None and posterior.weight is weight else ParameterPosterior(weight)
+        own = (
+            posterior
+            if posterior is not None and posterior.weight is weight
+            else ParameterPosterior(weight, own=random)
+        )
         posteriors[label] = own
         parameters: dict[str, Quantity] = {} if label == "none" or p < _LEAST else own.named()
         moved = own.moved()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
 
@@ -19,6 +19,7 @@ from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.sample import Draws, sample
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.own_random import OwnRandom
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant, plant
@@ -34,7 +35,10 @@ class ParameterPosterior:
     `draws` of its hypothesis's coordinates; by Laplace's approximation where None.
     """
 
-    def __init__(self, weight: Weight, draws: Draws | None = None, seed: int = 0) -> None:
+    def __init__(
+        self, weight: Weight, draws: Draws | None = None, seed: int = 0, own: Sequence[OwnRandom] = ()
+    ) -> None:
+        self._own = own
         self.weight, self.hypothesis = weight, weight.examined.hypothesis
         self.names = () if weight.label in ("none", "unknown") else tuple(weight.label.split("+"))
         self._given = draws
@@ -101,13 +105,11 @@ class ParameterPosterior:
         return out
 
     def plant(self, baseline: GapPlant | None, sigma: float) -> GapPlant:
-        """The repaired simulator at the posterior mean, with its random causes. Effects act from the start of a drive,
-        even where the car has them from an onset, but for a change of the gain."""
-        mean = self.hypothesis.copy()
-        for name in mean.free:
-            mean[name] = float(self._column(name).mean())
-        mean.effects = list(self.effects)
-        car = plant_of(mean, baseline)
+        """The repaired simulator at the mode, with its random causes. Effects act from the start of a drive, even where
+        the car has them from an onset, but for a change of the gain."""
+        named = self.hypothesis.copy()
+        named.effects = list(self.effects)
+        car = plant_of(named, baseline)
         return plant(self._random_effects(), baseline=car, sigma=sigma)
 
     # inside --------------------------------------------------------------------------------------------------------
@@ -130,7 +132,8 @@ class ParameterPosterior:
         slow, data = self.weight.composition.slow, self.hypothesis.data
         seconds = len(data.time) * data.dt
         out: dict[str, dict[str, Quantity]] = {}
-        if "gust" in self.names:
+        likes = {each.like for each in self._own if each.kind.name in self.names}
+        if "gust" in self.names or "gust" in likes:
             spread = math.hypot(math.sqrt(slow.gust_time / seconds), _GRID_STEP)
             out["gust"] = {
                 "sd_mps2": _log_normal(slow.gust_sd, spread),
@@ -141,7 +144,7 @@ class ParameterPosterior:
             spread = math.hypot(math.sqrt(slow.road_length / way), _GRID_STEP)
             out["road_grade"] = {"grade_rms": _log_normal(slow.road_sd / GRAVITY, spread)}
         found = self.weight.examined.outliers
-        if "outliers" in self.names and found is not None:
+        if ("outliers" in self.names or "outliers" in likes) and found is not None:
             count, rows = max(len(found.starts), 1), len(data.time)
             errors = found.errors[found.starts] if len(found.starts) else np.ones(1)
             noise = 1.4826 * float(np.median(np.abs(np.diff(found.errors)))) / math.sqrt(2)
@@ -150,20 +153,25 @@ class ParameterPosterior:
                 "fraction": _log_normal(count / rows, 1 / math.sqrt(count)),
                 "scale": _log_normal(scale, 1 / math.sqrt(2 * count)),
             }
-        return out
+        for each in self._own:
+            if each.kind.name in self.names and each.like in out:
+                out[each.kind.name] = {own: out[each.like][key] for key, own in each.parameters.items()}
+        return {name: x for name, x in out.items() if name in self.names}
 
     def _random_effects(self) -> list[Effect]:
         sizes = {name: {key: q.mean for key, q in own.items()} for name, own in self._random().items()}
-        out: list[Effect] = []
-        if "gust" in sizes:
-            out.append(Gust(**sizes["gust"]))
-        if "outliers" in sizes:
-            found = self.weight.examined.outliers
-            assert found is not None
+        kinds: dict[str, type[Effect]] = {"gust": Gust, "outliers": Outliers}
+        kinds |= {each.kind.name: each.kind for each in self._own}
+        found = self.weight.examined.outliers
+        noise = 0.0
+        if found is not None:
             noise = 1.4826 * float(np.median(np.abs(np.diff(found.errors)))) / math.sqrt(2)
-            out.append(Outliers(**sizes["outliers"]).in_noise(noise))
-        if "road_grade" in sizes:
-            out.append(road_along(self.hypothesis, RoadGrade(sizes["road_grade"]["grade_rms"])))
+        out: list[Effect] = []
+        for name, own in sizes.items():
+            if name == "road_grade":
+                out.append(road_along(self.hypothesis, RoadGrade(own["grade_rms"])))
+            else:
+                out.append(kinds[name](**own).in_noise(noise))
         return out
 
 
