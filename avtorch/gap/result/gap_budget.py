@@ -21,7 +21,7 @@ from avtorch.gap.answer.shrinkage import MetricShrinkage, Shrinkage
 from avtorch.gap.engine.average import ModelAverage
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.held_out import HeldOut
-from avtorch.gap.result.hypotheses import onset_of
+from avtorch.gap.result.hypotheses import aliases_of, onset_of, part_probability
 from avtorch.gap.result.parameters import ParameterPosterior
 from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.io import Log
@@ -70,8 +70,8 @@ def budget_of(
         parts.append(
             Part(
                 name,
-                _aliases(average, name),
-                average.marginal(name),
+                aliases_of(average, name),
+                part_probability(average, name),
                 _quantity(share),
                 float(np.sqrt(after / bottom)),
                 quantities,
@@ -213,38 +213,24 @@ def _metric(levels: FloatArray, drawn: FloatArray, horizon: float | None, *, den
     return MetricShrinkage(float(before), float(after), float(floor), closed, horizon)
 
 
-def _aliases(average: ModelAverage, name: str) -> tuple[str, ...]:
-    """Effects that stand in the place of `name` in hypotheses that are as probable within the alias set's bounds."""
-    out = [name]
-    top = average.label.split("+")
-    for label, p in average.probabilities.items():
-        own = label.split("+")
-        if p < 0.03 or label in ("none", "unknown") or name in own:
-            continue
-        others = [n for n in own if n not in top]
-        if len(others) == 1 and set(top) - {name} <= set(own):
-            out.append(others[0])
-    return tuple(dict.fromkeys(out))
-
-
 def _chance(
     average: ModelAverage, posterior: ParameterPosterior, names: Sequence[str], chance: Sequence[str]
 ) -> tuple[ChancePart, ...]:
     own: Mapping[str, Mapping[str, Quantity]] = posterior.by_effect()
     out = []
     for name in chance:
-        if name not in names or average.marginal(name) < LIKELY:
+        if name not in names or part_probability(average, name) < LIKELY:
             continue
         quantities = dict(own.get(name, {}))
         kinds = [EFFECTS[name]] if name in EFFECTS else []
         out.append(
             ChancePart(
                 name,
-                average.marginal(name),
+                part_probability(average, name),
                 _share_of_noise(posterior, name),
                 quantities,
                 not implausible(quantities, {}, kinds),
-                _aliases(average, name),
+                aliases_of(average, name),
             )
         )
     return tuple(out)

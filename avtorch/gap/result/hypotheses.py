@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from avtorch.gap.answer.budget import LIKELY
 from avtorch.gap.answer.plausibility import implausible
-from avtorch.gap.answer.verdict import ALWAYS, Candidate, Verdict, candidate_name
+from avtorch.gap.answer.verdict import ALIAS_RATIO, ALWAYS, Candidate, Verdict, candidate_name
 from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.coordinates import base_name
 from avtorch.gap.engine.drive_data import DriveData
@@ -65,13 +65,34 @@ def _rate_onset(h: Hypothesis, rows: Sequence[int]) -> float | None:
 
 
 def verdict_names(average: ModelAverage, shares: Mapping[str, float] | None = None) -> tuple[str, ...]:
-    """Causes that are there with a probability of a half or more, the largest of `shares` first; `("none",)` or
-    `("unknown",)`, the more probable, where there are none."""
+    """Causes of the most probable hypothesis that, they or their aliases, are there with a probability of a half or
+    more, and others of which that holds by themselves, the largest of `shares` first; `("none",)` or `("unknown",)`,
+    the more probable, where there are none."""
     names = {n for label in average.probabilities for n in label.split("+")} - set(ALWAYS)
-    likely = [n for n in names if average.marginal(n) >= LIKELY]
+    own = set(average.label.split("+"))
+    likely = [n for n in names if (part_probability(average, n) if n in own else average.marginal(n)) >= LIKELY]
     if likely:
         return tuple(sorted(likely, key=lambda n: (-(shares or {}).get(n, 0.0), -average.marginal(n), n)))
     return (max(ALWAYS, key=lambda n: average.probabilities[n]),)
+
+
+def aliases_of(average: ModelAverage, name: str) -> tuple[str, ...]:
+    """Effects that stand in the place of `name` in hypotheses of some probability, `name` first."""
+    out = [name]
+    top = set(average.label.split("+"))
+    for label, p in average.probabilities.items():
+        own = set(label.split("+"))
+        others = own - top
+        one_other = len(others) == 1 and not others & set(ALWAYS)
+        if p >= ALIAS_RATIO and name not in own and one_other and top - {name} <= own:
+            out += others
+    return tuple(dict.fromkeys(out))
+
+
+def part_probability(average: ModelAverage, name: str) -> float:
+    """That `name`, or an effect that these drives do not tell from it, is among the causes."""
+    alike = set(aliases_of(average, name))
+    return min(sum(p for label, p in average.probabilities.items() if alike & set(label.split("+"))), 1.0)
 
 
 def best_weight(average: ModelAverage, names: Sequence[str]) -> Weight:
@@ -106,7 +127,7 @@ def why(average: ModelAverage, names: Sequence[str], known: str) -> str:
         return f"What is missing answers to no {known}; {rival}."
     if label in average.probabilities:
         return f"{label} has probability {average.probabilities[label]:.3g}; {rival}."
-    each = ", ".join(f"{n} {average.marginal(n):.2g}" for n in names)
+    each = ", ".join(f"{n} {part_probability(average, n):.2g}" for n in names)
     return f"Each of these causes is there with a probability of a half or more ({each}); {rival}."
 
 
