@@ -20,7 +20,6 @@ from avtorch.gap.likelihood.gauss_newton import finish, modes, residuals
 from avtorch.gap.likelihood.noise_fit import GUST, fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.posterior.density import root
 from avtorch.gap.simulator.effect import delay_key
 
 _START = NoiseModel(process_sd=0.05, force_sd=0.1, speed_sd=0.02)
@@ -61,7 +60,7 @@ class Identified:
     ) -> dict[str, FloatArray]:
         """Parameters (draw,) of a normal posterior in `z`."""
         noise = np.random.default_rng(seed).standard_normal((count, len(self.z)))
-        spread = root(self.covariance if covariance is None else covariance).numpy()
+        spread = _root(self.covariance if covariance is None else covariance)
         z = np.clip(self.z + noise @ spread.T, -8.0, 8.0)
         return {k: x.numpy() for k, x in self.candidate.values(z).items()}
 
@@ -121,3 +120,9 @@ def _starts(candidate: Followed) -> FloatArray:
     out = np.tile(centre, (len(_DELAYS_S), 1))
     out[:, at] = [candidate.coordinates[at].z_of(d) for d in _DELAYS_S]
     return out
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """A root of a covariance, valid also where round-off made it indefinite."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    return vectors * np.sqrt(np.maximum(values, 1e-14))

@@ -104,7 +104,7 @@ def budget_of(
         unexplained=Unexplained(unnamed, matters, average.probabilities["unknown"] if not parts else beyond),
         baseline={key: held.chain[0][key] for key in ("T_L", "K_L")},
         repaired=posterior.moved(),
-        chance=_chance(average, posterior, names, (*CHANCE, *chance)),
+        chance=_chance(average, posterior, names, tuple(dict.fromkeys((*CHANCE, *chance)))),
         material=material,
         horizon_s=held.horizon_s,
         by_drives=held.blocks.by_drives,
@@ -152,11 +152,11 @@ def shrinkage_of(held: HeldOut, seed: int = 0) -> Shrinkage:
 def _energies(held: HeldOut) -> tuple[FloatArray, FloatArray]:
     """Energies (model, block) of the chain and (block,) of the floor, each channel over its own floor."""
     levels = np.stack([x.squares for x in held.steps])  # model, channel, block
-    sizes = np.asarray(held.blocks.sizes, float)
-    floor = np.minimum(held.floor.squares.sum(1), levels[-1].sum(1)) / sizes.sum()
-    floor = np.maximum(floor, 1e-12)
-    scale = floor[:, None] * sizes.sum() / len(sizes)
-    return (levels / scale).mean(1), (held.floor.squares / scale).mean(0)
+    # where a black box on top only harms, the model itself is the floor
+    worse = held.floor.squares.sum(1) > levels[-1].sum(1)
+    bottom = np.where(worse[:, None], levels[-1], held.floor.squares)
+    scale = np.maximum(bottom.mean(1), 1e-12)[:, None]
+    return (levels / scale).mean(1), (bottom / scale).mean(0)
 
 
 def _levels(held: HeldOut) -> list[tuple[float, float, float]]:
