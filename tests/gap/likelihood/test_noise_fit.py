@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -12,8 +10,7 @@ from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.noise_fit import GUST, PRIORS, Prior, fit_noise
 from avtorch.gap.likelihood.noise_model import NAMES, NoiseModel
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.search.onset import allowed, onset_profile
-from tests.gap.records import BOTH, drawn_errors, errors_of, log_of, ornstein, record_of
+from tests.gap.records import BOTH, errors_of, log_of, record_of
 
 
 def _drawn(rng: np.random.Generator, priors: dict[str, Prior], T_L: float) -> NoiseModel:
@@ -108,30 +105,3 @@ def test_row_likelihoods_sum_to_the_whole(rate_hz: int, fresh_seed: int) -> None
     assert rows.sum() == pytest.approx(float(WhiteningFilter(record, noise).log_likelihood(errors)))
     fit = fit_noise(record, errors, noise, T_L=0.35)
     np.testing.assert_allclose(fit.rows, WhiteningFilter(record, fit.noise).row_likelihoods(errors), rtol=0, atol=1e-8)
-
-
-@pytest.mark.statistical
-def test_the_moment_a_force_sets_in_is_found(rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
-    record = record_of(100.0, noise=None)
-    calm = NoiseModel(process_sd=0.03, accel_sd=0.03, speed_sd=0.01, force_sd=0.003)
-    truth = replace(calm, force_sd=0.3, force_time=2.0)
-    at = 900
-    errors = drawn_errors(calm, record.rows, record.dt, rng)
-    force, gained = ornstein(truth.force_sd, truth.force_time, record.rows - at, record.dt, rng)
-    errors[0, at:] += force
-    errors[1, at:] += gained
-    errors = errors[..., None]
-
-    quiet = WhiteningFilter(record, calm).row_likelihoods(errors)
-    loud = WhiteningFilter(record, truth).row_likelihoods(errors)
-    along = onset_profile(quiet, loud)
-    within = allowed(record.rows, record.dt)
-    onset = within.start + int(np.argmax(along[within]))
-    # the force begins at any size, now and then near nought: it grows by 0.3 m/s² within its time constant
-    assert abs(onset - at) * record.dt < 3.0
-    fit = fit_noise(record, errors, truth, T_L=0.35, priors=GUST, gust_onset=onset, iterations=10)
-    whole = fit_noise(record, errors, truth, T_L=0.35, priors=GUST, iterations=10)
-    assert fit.rows.sum() > whole.rows.sum() + 20
-    for name in ("force_sd", "force_time"):
-        assert abs(np.log(getattr(fit.noise, name) / getattr(truth, name))) < 6 * fit.sds[name]

@@ -13,9 +13,8 @@ from avtorch.errors import InputError
 from avtorch.gap import plant
 from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.hypothesis import Hypothesis
+from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.search.fitted_model import first_noise, without_outliers
-from avtorch.gap.search.outliers import HeavyTails
 from avtorch.gap.sensor_noise import with_sensor_noise
 from avtorch.io import Log
 from tests.gap.records import log_of
@@ -65,7 +64,7 @@ def test_a_drivers_rows_change_no_likelihood(
         record = Record.of(with_sensor_noise(one)[0])
         hypothesis = Hypothesis.named(record, effects, plant())
         z = np.linspace(-0.5, 0.5, hypothesis.size)[None]
-        white = WhiteningFilter(record, first_noise(record))
+        white = WhiteningFilter(record, NoiseModel())
         errors = hypothesis.errors(z)
         told.append((errors, white.log_likelihood(errors), hypothesis.rollouts(z, onset=record.rows // 2)))
         if hypothesis.grade_columns is not None:
@@ -127,30 +126,6 @@ def test_far_down_the_road_under_the_driver_lies_another_road() -> None:
     assert first is not None
     assert second is not None
     assert float(second[0] - first[-1]) == pytest.approx(1000.0)
-
-
-def test_glitches_are_put_right_where_they_are() -> None:
-    """Rows are counted over all drives, also where some are too short to be one or hold no whole groups."""
-    log = log_of(seconds=50.0, rate_hz=50)
-    assert log.accel is not None
-    engaged = np.ones(log.rows, bool)
-    for begin, end in ((611, 640), (655, 700), (1403, 1404)):
-        engaged[begin:end] = False
-    accel = log.accel.copy()
-    glitches = [300, 905, 1401, 2203]
-    accel[glitches] += 5.0
-    accel[~engaged] = 30.0
-    log = replace(log, engaged=engaged, accel=accel)
-    record = Record.of(log)
-    raw = Record.of(log, rate_hz=1e9, multiple=record.group)
-    rows = np.concatenate([np.arange(log.rows)[cut.rows] for cut in raw.cuts])[raw.source]
-    hit = np.isin(rows, glitches)
-    assert hit.sum() == len(glitches)
-    (clean,) = without_outliers([log], raw, HeavyTails(10.0, 0.01, 7.0, (1.0, 1.0), hit, np.zeros(raw.rows)))
-    assert clean.accel is not None
-    assert np.flatnonzero(clean.accel != accel).tolist() == glitches
-    # the driver's rows beside a glitch are no measure of the car
-    assert np.abs(clean.accel[glitches]).max() < 3
 
 
 @pytest.mark.parametrize("driven", [slice(None), slice(0, None, 2)], ids=["all by hand", "every other row"])
