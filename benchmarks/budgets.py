@@ -112,7 +112,11 @@ def main() -> None:
                 in_front(joined(logs), size)
             continue
         begun = time.process_time()
-        budget = gap_budget(logs)
+        try:
+            budget = gap_budget(logs)
+        except InputError as fault:
+            print(f"| {name} | | | ({fault}) | | | |", flush=True)
+            continue
         spent = time.process_time() - begun
         halves = " / ".join(tried(half(logs, which)) for which in (0, 1))
         share = f"{budget.before:.2f} to {budget.left:.2f}"
