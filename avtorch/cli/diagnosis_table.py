@@ -109,9 +109,7 @@ def diagnosis_notes(found: Diagnosis) -> list[str]:
     ]
     lines = [escape(line) for line in plain]
     if not found.complete:
-        text = (
-            "The budget ended the search: the answer is provisional; give the command a larger one."
-        )
+        text = "The budget ended the search: the answer is provisional; give the command a larger one."
         lines.append(f"[yellow]{text}[/]")
     return lines + [f"[dim]{escape(note)}[/]" for note in found.notes if found.complete or "budget" not in note]
 

@@ -91,7 +91,7 @@ def _window(x: FloatArray, length: int, keeps: float) -> FloatArray:
 
 
 def products(
-    metric: ErrorMetric, record: Counted, errors: FloatArray, blocks: Sequence[slice], lag: float
+    metric: ErrorMetric, record: Record | Counted, errors: FloatArray, blocks: Sequence[slice], lag: float
 ) -> FloatArray:
     """(block, one, other): sums of products of `errors` (one, channel, counted, group) of long rollouts, by a measure.
 
@@ -110,7 +110,7 @@ def products(
 
 
 def block_squares(
-    record: Counted, errors: FloatArray, blocks: Sequence[slice], lag: float, horizon: float
+    record: Record | Counted, errors: FloatArray, blocks: Sequence[slice], lag: float, horizon: float
 ) -> dict[str, FloatArray]:
     """Squared rollout errors of each block (block,), by metric, of a long rollout's `errors` (channel, counted, group).
 
@@ -123,7 +123,7 @@ def block_squares(
     return out
 
 
-def rms(metric: RolloutMetric, record: Counted, errors: FloatArray, lag: float) -> float:
+def rms(metric: RolloutMetric, record: Record | Counted, errors: FloatArray, lag: float) -> float:
     """Root mean square of a long rollout's `errors` (channel, counted, group) by a measure, over all counted rows;
     `lag` [s]."""
     edges = [*record.starts.tolist(), record.rows]
@@ -131,7 +131,7 @@ def rms(metric: RolloutMetric, record: Counted, errors: FloatArray, lag: float) 
     return float(np.sqrt(total / (record.rows * record.group)))
 
 
-def reached(metric: ErrorMetric, record: Counted) -> float | None:
+def reached(metric: ErrorMetric, record: Record | Counted) -> float | None:
     """Longest rollouts [s] of a measure that the stretches hold; None: as long as the stretches."""
     if metric.horizon_s is None or not np.isfinite(metric.horizon_s):
         return None

@@ -27,8 +27,8 @@ class GearShift(Effect):
     """Where the speed rises through one of `speeds` [m/s], a positive command loses the share `depth` for `duration_s`.
 
     Neutral at depth 0. Without `speeds`, they are those of a gearbox with constant ratio: `first_mps`, each next one
-    `gear_ratio` times the previous. Once the speed has fallen `rearm_mps` below a shift speed, the gear has changed back,
-    without an interruption. The crossing is interpolated between rows, and a row loses drive for the part of
+    `gear_ratio` times the previous. Once the speed has fallen `rearm_mps` below a shift speed, the gear has changed
+    back, without an interruption. The crossing is interpolated between rows, and a row loses drive for the part of
     its step that lies in the interruption, so the response is differentiable in duration and speeds.
 
     Possible are interruptions of 0.02 s (dual clutch) to 2.5 s (automated gearbox of a truck).

@@ -342,7 +342,7 @@ class DriveData:
                 self.frames.append((begin + warm + (length - (count + 1) * M) // 2, count))
         self.frame_time = np.concatenate([self.time[i + M * (1 + np.arange(count))] for i, count in self.frames])
         self.used = np.ones(len(self.frame_time), bool)
-        self.frequency = (np.arange(M) + 0.5) / (2 * M * self.dt)
+        self.frequency = np.asarray((np.arange(M) + 0.5) / (2 * M * self.dt), np.float64)
         least = -(-_LEAST_COEFFICIENTS // len(self.frame_time))  # bins: a covariance of few coefficients is singular
         edges = [0, least, 2 * least, 3 * least]
         while edges[-1] < M:

@@ -328,7 +328,8 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float, iterations: int =
 
     # at a crease of the likelihood the parameters alone promise something: that is no course's
     white = np.array([whiten(data, h.covariance, j) for j in h.jacobian])
-    alone = np.linalg.solve(white @ white.T + np.diag(precision), white @ whiten(data, h.covariance, h.residual) + pull)
+    score = white @ whiten(data, h.covariance, h.residual) + pull
+    alone = np.asarray(np.linalg.solve(white @ white.T + np.diag(precision), score), np.float64)
     promised = max(gain(alone, h.residual - np.einsum("p,pcfk->cfk", alone, h.jacobian))[0], 0.0)
     noise, left = h.covariance, h.residual
     best = FreeFormFit(-math.inf, None, np.zeros(frames))

@@ -1,18 +1,20 @@
-"""Every constant of the engine: priors with their unit and source, and the resolution of its coefficients.
+"""Priors of the engine with their unit and source, odds in nats, and the resolution of its coefficients.
 
-Nothing else in the engine decides by a number. Probabilities come from evidence, tempered by `TEMPER`.
+Probabilities come from evidence, tempered by `TEMPER`. Grids, priors of random forces and tolerances of numerical work
+stand in the files that use them.
 """
 
 from __future__ import annotations
 
 TEMPER = 0.25
 """Power of the likelihood in the model average [-]. Coefficients of neighbouring frames and bins are not independent,
-and no equation is exact (SafeBayes; Grünwald and van Ommen 2017). Fitted to calibration on simulated logs."""
+and no equation is exact (SafeBayes; Grünwald and van Ommen 2017). Chosen on simulated logs."""
 
 EFFECT_NATS = 10.0
 """What the presence of one more effect costs before tempering [nats]: prior odds of exp(-2.5), one in twelve."""
 EFFECT_NATS_ALONE = 6.0
-"""The same with one channel [nats]: below `ONE_CHANNEL_HZ` there are tens of times fewer coefficients to be wrong in."""
+"""The same with one channel [nats]: below `ONE_CHANNEL_HZ` there are tens of times fewer coefficients to be wrong
+in."""
 SLOW_FORCE_NATS = 7.0
 """The same for a slow random force (gust, road) [nats]: any drive meets some wind and slope."""
 UNKNOWN_NATS = 12.0

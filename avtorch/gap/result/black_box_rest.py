@@ -1,6 +1,6 @@
 """What a black box still foretells of held-out blocks: a bound on what any model could.
 
-    r = X beta + n,     beta ~ N(0, sd^2),     X: what forces that commands, speed and time could make do to all channels
+    r = X beta + n,    beta ~ N(0, sd^2),    X: what forces that commands, speed and time could make do to all channels
 
 r is what a hypothesis leaves, in lapped coefficients; the noise's covariance is free in every band and estimated anew,
 as everywhere. Columns look back only, over the whole band: in a closed loop a command answers the noise of the moment,
@@ -14,7 +14,6 @@ have missed is the spread of its posterior.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -29,6 +28,7 @@ from avtorch.gap.result.free_runs import Blocks, compared, readings
 _LAGS_S = (0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
 _SMOOTH_S = 0.5  # of the speed: little of the noise of the moment is in it
 _LINEAR, _MAP, _TIME = range(3)  # sets of columns, each with those before it
+_BODY, _ACCEL, _SPEED = range(3)  # where a column acts
 _PRIOR_SD = np.geomspace(0.001, 3.0, 12)  # of a coefficient [m/s²]
 _POOLED = (1, 200)  # coefficients a channel that tell a band's noise: free bands swallow what few coefficients show
 _STEPS = 4  # alternations between coefficients and noise
@@ -47,12 +47,12 @@ class Predicted(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BlackBox:
-    """Columns beside a hypothesis: `forces`, then `faults` (column, row), each of a set `kind` (column,), and the
-    `readings` (column, channel, row) and `coefficients` (column, channel, frame, bin) that they make."""
+    """Columns beside a hypothesis: `rows` (column, row), each at a `place` (column,) and in a set `kind` (column,), and
+    the `readings` (column, channel, row) and `coefficients` (column, channel, frame, bin) that they make."""
 
     hypothesis: Hypothesis
-    forces: FloatArray = field(repr=False)
-    faults: FloatArray = field(repr=False)
+    rows: FloatArray = field(repr=False)
+    place: IntArray = field(repr=False)
     kind: IntArray = field(repr=False)
     readings: FloatArray = field(repr=False)
     coefficients: FloatArray = field(repr=False)
@@ -61,13 +61,14 @@ class BlackBox:
     def of(cls, h: Hypothesis) -> BlackBox:
         """The columns that commands, speed, time and the hypothesis's own response make."""
         signals = _signals(h)
-        forces, kind = _forces(h.data, signals)
-        faults = forces[:0]
+        each = [(_BODY, _forces(h.data, signals))]
         if h.data.channel_count == 2:
-            faults, own = _faults(signals)
-            kind = np.concatenate([kind, own])
-        shown = np.stack([_shown(h, x) for x in forces] + [_shown(h, None, x) for x in faults])
-        return cls(h, forces, faults, kind, shown, np.stack([h.data.transform(compared(h.data, x)) for x in shown]))
+            each += [(_ACCEL, _of_accelerometer(signals)), (_SPEED, _of_speed(signals))]
+        rows = np.array([x for _, sets in each for one in sets for x in one])
+        place = np.array([at for at, sets in each for one in sets for _ in one])
+        kind = np.array([number for _, sets in each for number, one in enumerate(sets) for _ in one])
+        shown = np.stack([_shown(h, at, x) for at, x in zip(place, rows, strict=True)])
+        return cls(h, rows, place, kind, shown, np.stack([h.data.transform(compared(h.data, x)) for x in shown]))
 
     def predict(self, residuals: FloatArray, errors: FloatArray, blocks: Blocks) -> Predicted:
         """What the columns foretell of each fold's blocks, taught by the `residuals` (fold, channel, frame, bin) of the
@@ -95,10 +96,7 @@ class BlackBox:
                     possible[:, c, b] = ((draws @ gram) * draws).sum(1)
                     gains[:, k] += (2 * means[:, k] @ match - ((means[:, k] @ gram) * means[:, k]).sum(1)) / before[c]
         others = gains.sum(1, keepdims=True) - gains
-        rows, split = [], len(self.forces)
-        for k, way in enumerate(others.argmax(0)):
-            beta = means[way, k]
-            rows.append(_shown(h, beta[:split] @ self.forces, beta[split:] @ self.faults))
+        rows = [np.tensordot(means[way, k], self.readings, 1) for k, way in enumerate(others.argmax(0))]
         coefficients = [h.data.transform(compared(h.data, x)) for x in rows]
         return Predicted(np.stack(rows), np.stack(coefficients), possible)
 
@@ -173,18 +171,16 @@ def _pooling(counts: IntArray, least: int) -> FloatArray:
 
 
 # what is shown -------------------------------------------------------------------------------------------------------
-def _shown(h: Hypothesis, force: FloatArray | None, fault: FloatArray | None = None) -> FloatArray:
-    """Readings (channel, row) that a force (row,) and a fault of the accelerometer (row,) [m/s²] make."""
-    if force is None:
-        out = np.zeros((h.data.channel_count, len(h.data.time)))
-    else:
-        grid = h.data.grid
-        step = np.where(grid.starts, 0.0, np.diff(grid.time, prepend=grid.time[:1]))
-        acts = force[grid.row]
-        out = readings(h, acts, np.cumsum(step * np.concatenate([acts[:1], acts[:-1]])))
-    if fault is not None and h.data.accel is not None:
-        out[0] += fault
-    return out
+def _shown(h: Hypothesis, place: int, x: FloatArray) -> FloatArray:
+    """Readings (channel, row) that a force (row,) [m/s²], or an error of the accelerometer or of the speed, makes."""
+    if place != _BODY:
+        out = np.zeros((2, len(x)))
+        out[0 if place == _ACCEL else 1] = x
+        return out
+    grid = h.data.grid
+    step = np.where(grid.starts, 0.0, np.diff(grid.time, prepend=grid.time[:1]))
+    acts = x[grid.row]
+    return readings(h, acts, np.cumsum(step * np.concatenate([acts[:1], acts[:-1]])))
 
 
 # columns -------------------------------------------------------------------------------------------------------------
@@ -224,30 +220,31 @@ def _unit(x: FloatArray) -> FloatArray:
     return x / max(float(x.std()), 1e-9)
 
 
-def _forces(data: DriveData, signals: _Signals) -> tuple[FloatArray, IntArray]:
-    """Forces (column, row), each of size about one, and the set (column,) of each."""
+Sets = tuple[list[FloatArray], list[FloatArray], list[FloatArray]]
+"""Columns (row,) in sets: linear in command and response, maps, and what changes with time."""
+
+
+def _forces(data: DriveData, signals: _Signals) -> Sets:
     u, a, jerk, snap, v, t = signals
     lp = data.low_pass
     linear = [np.ones_like(a), u, a, jerk, snap, *(lp(u, lag) for lag in _LAGS_S)]
     one_sided = [np.minimum(a, 0.0), np.where(a < 0, jerk, 0.0), *(lp(np.minimum(u, 0.0), lag) for lag in (0.2, 0.8))]
     play = [np.tanh(4 * a), np.tanh(jerk), lp(np.tanh(4 * jerk), 0.3)]
     speed = [*_hats(v, 5), *(a * x for x in _hats(v, 5)), jerk * v]
-    time = [t, t**2, a * t, a * t**2, a * t**3]
-    return _of_sets(linear, [*one_sided, *play, *_hats(a, 9), *speed], time)
+    return linear, [*one_sided, *play, *_hats(a, 9), *speed], [t, t**2, a * t, a * t**2, a * t**3]
 
 
-def _faults(signals: _Signals) -> tuple[FloatArray, IntArray]:
-    """Errors of the accelerometer (column, row), and the set (column,) of each."""
+def _of_accelerometer(signals: _Signals) -> Sets:
     _, a, jerk, snap, v, t = signals
-    nonlinear = [np.minimum(a, 0.0), *_hats(v, 3), a * v, np.tanh(jerk)]
-    return _of_sets([np.ones_like(a), a, jerk, snap], nonlinear, [t, a * t])
+    return [np.ones_like(a), a, jerk, snap], [np.minimum(a, 0.0), *_hats(v, 3), a * v, np.tanh(jerk)], [t, a * t]
+
+
+def _of_speed(signals: _Signals) -> Sets:
+    _, a, _, _, v, _ = signals
+    return [a], [np.minimum(a, 0.0), a * v, *_hats(v, 3)], []
 
 
 def _hats(x: FloatArray, count: int) -> list[FloatArray]:
     """Linear splines (row,) that sum to one, on equidistant knots over the range of `x`: nothing extrapolates."""
     at = (count - 1) * (x - x.min()) / max(float(np.ptp(x)), 1e-9)
     return [np.maximum(1 - np.abs(at - k), 0.0) for k in range(count)]
-
-
-def _of_sets(*sets: Sequence[FloatArray]) -> tuple[FloatArray, IntArray]:
-    return np.array([x for one in sets for x in one]), np.repeat(np.arange(len(sets)), [len(one) for one in sets])

@@ -2,8 +2,8 @@
 
 The fits of the folds begin at the fit to all blocks and share its Jacobian (Gauss-Newton with a fixed slope, the chord
 method), so a fold costs three simulations. The predictive density of a held-out frame has the noise's covariance
-integrated out, as the likelihood has: with n coefficients a channel, of products A, taught in a band, and m, of products
-B, held out,
+integrated out, as the likelihood has: with n coefficients a channel, of products A, taught in a band, and m, of
+products B, held out,
 
     log p(B | A) = n/2 log det A - (n + m)/2 log det (A + B) + log Gamma_C((n + m)/2) - log Gamma_C(n/2) - m C/2 log pi
 
@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from scipy.special import multigammaln
+from scipy.special import multigammaln  # pyright: ignore[reportAttributeAccessIssue]
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.gap.answer.budget import HORIZON_S
@@ -77,7 +77,8 @@ class HeldOut:
     @property
     def frame_rows(self) -> FloatArray:
         """Rows (block,) that the densities are of: one hop a frame."""
-        return np.bincount(self.blocks.block_of_frame, minlength=len(self.blocks.rows)) * float(self.data.frame_rows)
+        frames = np.bincount(self.blocks.block_of_frame, minlength=len(self.blocks.rows))
+        return np.asarray(frames * float(self.data.frame_rows), np.float64)
 
 
 def held_out_errors(chain: Sequence[Hypothesis]) -> HeldOut | None:
@@ -104,13 +105,13 @@ def held_out_errors(chain: Sequence[Hypothesis]) -> HeldOut | None:
     if blocks is None:
         return None
     fitted = [_taught(h, blocks) for h in chain]
-    stitched = [blocks.stitched(x.errors) for x in fitted]
+    stitched = [blocks.stitched(list(x.errors)) for x in fitted]
     scored = [_scores(data, blocks, e, x.residuals, x.residuals) for x, e in zip(fitted, stitched, strict=True)]
     beside, foretold, possible = [], [], []
     for x, errors in ((fitted[-1], stitched[-1]), (fitted[0], stitched[0])):
         found = BlackBox.of(x.hypothesis).predict(x.residuals, errors, blocks)
         possible.append(found.possible)
-        foretold.append(blocks.stitched(found.readings))
+        foretold.append(blocks.stitched(list(found.readings)))
         beside.append(_scores(data, blocks, errors - foretold[-1], x.residuals, x.residuals - found.coefficients))
     longest = max(rows.stop - rows.start for rows in blocks.rows) * data.dt
     return HeldOut(
@@ -149,7 +150,7 @@ def entered(before: Hypothesis, after: Hypothesis) -> str:
     return next(base_name(e) for e in _sized(after) if e not in before.effects)
 
 
-# fits ------------------------------------------------------------------------------------------------------------------
+# fits -----------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class _Taught:
     """A hypothesis fitted without each fold: `values` (fold, parameter), residuals of all frames (fold, channel, frame,
@@ -249,7 +250,7 @@ def _scores(data: DriveData, blocks: Blocks, errors: FloatArray, taught: FloatAr
     for k, frames in enumerate(blocks.taught):
         own = fold == k
         nats[own] = _log_density(data.only(frames), taught[k][:, frames], residuals[k][:, own])
-    return Scores(squares, np.bincount(blocks.block_of_frame, nats, len(blocks.rows)))
+    return Scores(squares, np.asarray(np.bincount(blocks.block_of_frame, nats, len(blocks.rows)), np.float64))
 
 
 def _log_density(taught: DriveData, residual: FloatArray, held_out: FloatArray) -> FloatArray:
