@@ -1,4 +1,4 @@
-"""Aliases under one channel: exact in the response, equal in probability, and a set in the verdict."""
+"""Aliases under one channel: exact in the response, and effects that this channel cannot show."""
 
 from __future__ import annotations
 
@@ -20,18 +20,11 @@ from avtorch.gap import (
     SimulatorInput,
     plant,
 )
-from avtorch.gap.answer.verdict import Candidate, verdict_of
-from avtorch.gap.search.fitted_model import SearchResult
-from avtorch.gap.search.search import Search
-from avtorch.gap.selection.aliases import Identifiability, exact_aliases, lookalikes, note
-from avtorch.gap.simulator.effect import effect_class
+from avtorch.gap.answer.aliases import exact_aliases, in_place_of, lookalikes, note
 from avtorch.gap.simulator.observability import is_observable
-from tests.bars import log_odds
-from tests.gap.records import command_over, log_of
+from tests.gap.records import command_over
 
 ACCEL, SPEED, BOTH = ("accel",), ("speed",), ("accel", "speed")
-OFFSETS = ("sensor_bias", "constant_resistance", "dead_time")
-LAGS = ("sensor_lag", "second_order_actuator", "sensor_bias")
 BELOW, ABOVE = {"sensor_bias.bias_mps2": -0.1}, {"sensor_bias.bias_mps2": 0.1}
 
 
@@ -79,6 +72,16 @@ def test_untested_forces_alias_offsets_and_gusts() -> None:
         assert lookalikes(name, channels) == set()
 
 
+def test_in_the_place_of_one_effect_beside_others() -> None:
+    alike = {"constant_resistance", "aerodynamic_drag", "road_grade"}
+    assert in_place_of("sensor_bias", ["dead_time"], ACCEL, BELOW) == alike
+    assert in_place_of("sensor_bias", ["constant_resistance"], ACCEL, BELOW) == alike - {"constant_resistance"}
+    assert in_place_of("sensor_bias", [], ACCEL, ABOVE) == {"low_speed_creep", "road_grade"}
+    assert in_place_of("sensor_lag", ["rate_limit"], ACCEL) == set()
+    for channels in (SPEED, BOTH):
+        assert in_place_of("sensor_bias", [], channels, BELOW) == set()
+
+
 def test_untested_effects_are_reported() -> None:
     assert all(is_observable(e, BOTH) for e in EFFECTS.values())
     assert note(BOTH, EFFECTS.values()) is None
@@ -114,125 +117,3 @@ def test_aliases_respond_alike() -> None:
         assert float((filtered - poles).abs().max()) < 2e-3 * float(filtered.abs().max())
     scaled = EFFECTS["sensor_scale"](scale=1.2)  # type: ignore[call-arg]
     torch.testing.assert_close(_shown([scaled]), _shown([], K_L=1.2))
-
-
-# logs ----------------------------------------------------------------------------------------------------
-
-
-def _raced(
-    car: Sequence[Effect], effects: Sequence[str], channels: Sequence[str], seed: int
-) -> tuple[SearchResult, Identifiability]:
-    log = log_of(plant(car, T_L=0.35), seconds=60.0, channels=channels, rng=np.random.default_rng(seed))
-    kinds = [effect_class(name) for name in effects]
-    race = Search([log], plant(), effects=kinds, pairs=False).run()
-    return race, Identifiability.of(race, kinds)
-
-
-def _candidates(race: SearchResult, told: Identifiability) -> list[Candidate]:
-    """By evidence alone, 5 % for what is not known."""
-    gains = np.array([f.log_evidence for f in race.found])
-    shares = 0.95 * np.exp(gains - np.logaddexp.reduce(gains))
-    chances = told.shared({f.name: float(p) for f, p in zip(race.found, shares, strict=True)} | {"unknown": 0.05})
-    assert sum(chances.values()) == pytest.approx(1.0)
-    return [Candidate(name, p) for name, p in chances.items()]
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize(
-    ("car", "effects", "aliases"),
-    [
-        (SensorBias(-0.15), OFFSETS, {"sensor_bias", "constant_resistance"}),
-        (ConstantResistance(0.15), OFFSETS, {"sensor_bias", "constant_resistance"}),
-        (SensorLag(0.15), LAGS, {"sensor_lag", "second_order_actuator"}),
-    ],
-    ids=lambda x: getattr(x, "name", ""),
-)
-def test_by_acceleration_only_the_aliases_share(
-    car: Effect, effects: tuple[str, ...], aliases: set[str], rotating_seed: int
-) -> None:
-    race, told = _raced([car], effects, ACCEL, rotating_seed)
-    evidence = {f.name: f.log_evidence - race.none.log_evidence for f in race.found}
-    first, second = (evidence[name] for name in sorted(aliases))
-    # the same response: what is left between them are the priors of their parameters and, with a lag in the sensor, the
-    # colour of the noise (1.8 nats of standard deviation over 30 drives, where the lesser was 71 ahead of none, sd 9)
-    assert first == pytest.approx(second, abs=10)
-    assert min(first, second) > 15
-    candidates = _candidates(race, told)
-    chances = {c.name: c.probability for c in candidates}
-    assert len({chances[name] for name in aliases}) == 1
-    verdict = verdict_of(candidates, aliases=told.alias_set)
-    assert set(verdict.names) < aliases
-    assert aliases <= set(verdict.alias_set)
-
-
-@pytest.mark.statistical
-def test_an_offset_above_zero_is_no_resistance(rotating_seed: int) -> None:
-    race, told = _raced([SensorBias(0.15)], OFFSETS, ACCEL, rotating_seed)
-    verdict = verdict_of(_candidates(race, told), aliases=told.alias_set)
-    assert verdict.names == ("sensor_bias",)
-    assert "constant_resistance" not in verdict.alias_set
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize("channels", [SPEED, BOTH])
-def test_with_the_speed_a_resistance_is_one(channels: tuple[str, ...], rotating_seed: int) -> None:
-    race, told = _raced([ConstantResistance(0.15)], OFFSETS, channels, rotating_seed)
-    assert ("sensor_bias" in {f.name for f in race.found}) == (channels == BOTH)
-    verdict = verdict_of(_candidates(race, told), aliases=told.alias_set)
-    assert verdict.name == "constant_resistance"
-    assert "sensor_bias" not in verdict.alias_set
-
-
-@pytest.mark.statistical
-def test_by_speed_only_a_sensor_leaves_no_gap(rotating_seed: int) -> None:
-    race, told = _raced([SensorBias(-0.15), SensorLag(0.2)], (*OFFSETS, *LAGS[:2]), SPEED, rotating_seed)
-    assert {f.name for f in race.found} <= {"none", "constant_resistance", "dead_time", "second_order_actuator"}
-    assert told.note is not None
-    # nothing is there, and where nothing is, odds have a mean of 1 or less: there are three
-    assert max(f.log_evidence for f in race.found) - race.none.log_evidence < log_odds(3)
-
-
-# shares --------------------------------------------------------------------------------------------------
-
-
-def _told(values: dict[str, dict[str, float]], prior: dict[str, float] | None = None) -> Identifiability:
-    return Identifiability(ACCEL, values, tuple(EFFECTS.values()), prior or {})
-
-
-def test_an_alias_not_tried_gets_its_share() -> None:
-    told = _told({"none": {}, "dead_time+sensor_bias": BELOW})
-    chances = told.shared({"dead_time+sensor_bias": 0.9, "none": 0.06, "unknown": 0.04})
-    assert chances == {
-        "constant_resistance+dead_time": 0.45, "dead_time+sensor_bias": 0.45, "none": 0.06, "unknown": 0.04,
-    }  # fmt: skip
-    tried = [Candidate("dead_time+sensor_bias", 0.45, 31.0, onset_s=4.0), Candidate("none", 0.06, 0.0)]
-    tried.append(Candidate("unknown", 0.04))
-    (more,) = told.mirrored(tried, chances)
-    assert (more.name, more.probability, more.log_evidence) == ("constant_resistance+dead_time", 0.45, 31.0)
-    assert more.onset_s == 4.0
-    verdict = verdict_of([*tried, more], aliases=told.alias_set)
-    assert verdict.alias_set[:2] == ("dead_time+sensor_bias", "constant_resistance+dead_time")
-    assert set(verdict.alias_set[2:]) == {"none", "aerodynamic_drag+dead_time", "dead_time+road_grade"}
-
-
-def test_the_prior_bounds_what_is_shared() -> None:
-    chances = {"sensor_bias": 0.8, "constant_resistance": 0.1, "none": 0.1, "unknown": 0.0}
-    values = {"sensor_bias": BELOW, "constant_resistance": {"constant_resistance.resistance_mps2": 0.1}}
-    assert _told(values).shared(chances)["sensor_bias"] == pytest.approx(0.45)
-    assert _told(values, {"sensor_bias": 2.0}).shared(chances)["sensor_bias"] == pytest.approx(0.6)
-    barred = _told(values, {"constant_resistance": 0.0})
-    assert barred.shared(chances) == chances
-    assert "constant_resistance" not in barred.alias_set([Candidate("sensor_bias", 1.0)])
-    few = Identifiability(ACCEL, values, (SensorBias,))
-    assert few.shared({"sensor_bias": 0.9, "none": 0.1}) == {"sensor_bias": 0.9, "none": 0.1}
-    assert few.alias_set([Candidate("sensor_bias", 1.0)]) == ("sensor_bias",)
-
-
-def test_with_both_witnesses_nothing_changes() -> None:
-    told = Identifiability(BOTH, {"sensor_bias": BELOW}, tuple(EFFECTS.values()))
-    chances = {"sensor_bias": 0.9, "none": 0.07, "unknown": 0.03}
-    candidates = [Candidate(name, p) for name, p in chances.items()]
-    assert told.shared(chances) == chances
-    assert told.mirrored(candidates, chances) == []
-    assert verdict_of(candidates, aliases=told.alias_set) == verdict_of(candidates)
-    assert told.note is None

@@ -2,94 +2,95 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
+import torch
 
-from avtorch.gap import DeadTime
-from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.result.gap_size import gap_size
+from avtorch.arrays import FloatArray
+from avtorch.gap import DeadTime, Effect, SimulatorInput, plant
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.result.counted_rows import CountedRows
+from avtorch.gap.result.gap_size import Simulated, gap_size
 from avtorch.gap.rollout_errors import HORIZON_S
-from avtorch.gap.search.fitted_model import FittedModel, SearchResult
-from tests.gap.finds import found_of
+from avtorch.io import Log
+from avtorch.io.engagement import SETTLE_S
+from tests.gap.records import BOTH, command_over
 
-STILL = NoiseModel(process_sd=1e-6, force_sd=1e-6, accel_sd=0.05, speed_sd=0.02)
+LAG, GAIN = 0.4, 0.9
+ACCEL_SD, SPEED_SD = 0.05, 0.02
 
 
-def race_of(none: FittedModel, *others: FittedModel) -> SearchResult:
-    record = none.hypothesis.record
-    return SearchResult(record, record, (), (none, *others), complete=True)
+def drive(effects: Sequence[Effect] = (), *, rate_hz: int = 20, seconds: float = 32.0) -> tuple[Log, Simulated]:
+    """A log with white noise, and the bare car under its commands, measured less simulated."""
+    rng = np.random.default_rng(0)
+    time = np.arange(round(seconds * rate_hz)) / rate_hz
+    command = command_over(time)
+    told = SimulatorInput(torch.as_tensor(time), torch.as_tensor(command), torch.full((len(time),), 18.0).double())
+    car, bare = (plant(e, T_L=LAG, K_L=GAIN).response(told) for e in (effects, ()))
+    accel = car.accel_measured.numpy() + ACCEL_SD * rng.standard_normal(len(time))
+    speed = car.speed.numpy() + SPEED_SD * rng.standard_normal(len(time))
+    log = Log.from_arrays(time=time, accel_cmd=command, accel=accel, speed=speed)
+    rows = rows_of(log)
+    errors = [rows.of_rows(accel - bare.accel_measured.numpy()), rows.of_rows(speed - bare.speed.numpy())]
+    return log, Simulated(np.stack(errors), LAG)
+
+
+def rows_of(log: Log, channels: Sequence[str] = BOTH) -> CountedRows:
+    shown = {name: getattr(log, name) for name in channels}
+    own = Log.from_arrays(time=log.time, accel_cmd=log.accel_cmd, **shown)
+    return CountedRows.of(DriveData.of(own), (own,))
 
 
 @pytest.mark.parametrize("rate_hz", [20, 100])
 def test_one_step_is_the_hold_from_the_measured_acceleration(rate_hz: int) -> None:
-    none = found_of([], rate_hz=rate_hz, noise=STILL, seconds=20.0)
-    record = none.hypothesis.record
-    assert record.accel is not None
-    facts = gap_size(race_of(none), none, detected=False)
+    log, none = drive(rate_hz=rate_hz)
+    facts = gap_size(rows_of(log), none, none, detected=False)
     # Eq. 1 from each measured acceleration, its command held, at the log's own rate
-    drive, T, K = record.drives[0], none.values["T_L"], none.values["K_L"]
-    measured = record.accel.ravel()
-    keep = np.exp(-1 / rate_hz / T)
-    told = keep * measured[:-1] + (1 - keep) * K * drive.command.numpy()[:-1]
-    first = record.source[0] * record.group
-    want = np.sqrt(((measured[1:] - told)[first:] ** 2).mean())
+    assert log.accel is not None
+    assert log.accel_cmd is not None
+    keep = np.exp(-1 / rate_hz / LAG)
+    told = keep * log.accel[:-1] + (1 - keep) * GAIN * log.accel_cmd[:-1]
+    first = round(SETTLE_S * rate_hz)
+    want = np.sqrt(((log.accel[1:] - told)[first:] ** 2).mean())
     assert facts.one_step_rmse == pytest.approx(want, rel=1e-9)
-    # both of the sensor's draws are in it
-    assert facts.one_step_rmse == pytest.approx(0.05 * np.sqrt(1 + keep**2), rel=0.15)
+    # both of the sensor's draws are in it: 600 rows or more, four standard errors of their size
+    assert facts.one_step_rmse == pytest.approx(ACCEL_SD * np.sqrt(1 + keep**2), rel=0.15)
     assert facts.one_step_floor == facts.one_step_rmse
 
 
 def test_rollouts_begin_anew_at_every_row() -> None:
-    none = found_of([], noise=STILL, seconds=22.0)
-    rows = none.hypothesis.record.rows
-    dt = none.hypothesis.record.dt
+    log, none = drive()
+    rows = rows_of(log)
     # a rollout that lags behind by 0.1 m/s every second: off by how long ago it began, which is any time up to 10 s
-    errors = none.errors.copy()
-    errors[-1] = 0.1 * dt * np.arange(rows)[:, None] + 7.0
-    facts = gap_size(race_of(replace(none, errors=errors)), none, detected=True)
-    ages = [dt * np.arange(min(k + 1, round(HORIZON_S / dt))) for k in range(rows)]
+    errors: FloatArray = none.errors.copy()
+    errors[-1] = 0.1 * rows.dt * np.arange(rows.rows)[:, None] + 7.0
+    facts = gap_size(rows, Simulated(errors, LAG), none, detected=True)
+    ages = [rows.dt * np.arange(min(k + 1, round(HORIZON_S / rows.dt))) for k in range(rows.rows)]
     want = np.mean([((0.1 * age) ** 2).mean() for age in ages])
     assert facts.rollout_rmse_speed == pytest.approx(np.sqrt(want))
     assert facts.horizon_s == HORIZON_S == 10.0
 
 
-def test_a_short_stretch_is_its_own_horizon() -> None:
-    none = found_of([], noise=STILL, seconds=22.0)
-    record = none.hypothesis.record
-    halves = replace(record, stretch=(np.arange(record.rows) >= 160).astype(record.stretch.dtype) + record.stretch)
-    cut = replace(none, hypothesis=replace(none.hypothesis, record=halves.only(np.arange(record.rows) < 160)))
-    cut = replace(cut, errors=none.errors[:, :160])
-    facts = gap_size(race_of(cut), cut, detected=True)
-    assert facts.horizon_s == pytest.approx(160 * record.dt)
-
-
 def test_a_late_car_shows_and_its_floor_is_the_noise() -> None:
-    late = found_of([DeadTime(0.3)], noise=STILL)
-    candidate = replace(late.hypothesis, effects=())
-    z = late.z[:2]
-    none = replace(late, name="none", hypothesis=candidate, z=z, errors=candidate.errors(z[None])[0])
-    facts = gap_size(race_of(none, late), late, detected=True)
+    log, none = drive([DeadTime(0.3)])
+    best = drive()[1]  # the same noise, and nothing missing
+    rows = rows_of(log)
+    facts = gap_size(rows, none, best, detected=True)
     assert facts.rollout_rmse_accel is not None
     assert facts.rollout_rmse_accel > 0.2
     # 600 rows: within four standard errors of the sensor's noise
-    assert facts.rollout_floor_accel == pytest.approx(0.05, rel=4 / np.sqrt(2 * 560))
+    assert facts.rollout_floor_accel == pytest.approx(ACCEL_SD, rel=4 / np.sqrt(2 * 560))
     # a favourite that leaves more than the baseline is no floor
-    turned = SearchResult(candidate.record, candidate.record, (), (replace(late, name="none"), none), complete=True)
-    facts = gap_size(turned, none, detected=True)
+    facts = gap_size(rows, best, none, detected=True)
     assert facts.rollout_floor_accel == facts.rollout_rmse_accel
 
 
 def test_a_witness_that_is_missing_has_no_figure() -> None:
-    none = found_of([], noise=STILL, seconds=20.0)
-    record = none.hypothesis.record
-    blind = replace(record, accel=None)
-    found = replace(none, hypothesis=replace(none.hypothesis, record=blind), errors=none.errors[-1:])
-    facts = gap_size(race_of(found), found, detected=False)
+    log, none = drive(seconds=20.0)
+    blind, deaf = (Simulated(none.errors[k : k + 1], LAG) for k in (1, 0))
+    facts = gap_size(rows_of(log, ["speed"]), blind, blind, detected=False)
     assert (facts.one_step_rmse, facts.one_step_floor, facts.rollout_rmse_accel) == (None, None, None)
     assert facts.rollout_rmse_speed is not None
-    deaf = replace(
-        none, hypothesis=replace(none.hypothesis, record=replace(record, speed=None)), errors=none.errors[:1]
-    )
-    assert gap_size(race_of(deaf), deaf, detected=False).rollout_rmse_speed is None
+    assert gap_size(rows_of(log, ["accel"]), deaf, deaf, detected=False).rollout_rmse_speed is None

@@ -9,7 +9,6 @@ import pytest
 
 from avtorch.gap import EFFECTS, Budget, ChannelError, Part, Unexplained
 from avtorch.gap.answer.verdict import Candidate, Verdict, candidate_name
-from avtorch.gap.budget.account import shared_out
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis, GapSize, LogFacts
 
@@ -45,11 +44,16 @@ def seven() -> Diagnosis:
         baseline={"T_L": 0.3, "K_L": 1.0},
         repaired={"T_L": about(0.4), "K_L": about(0.9)},
     )
-    kinds = [EFFECTS[name] for name in NAMES]
-    likelihood = [Candidate("none", 0.02, 0.0), Candidate("unknown", 0.9, None), Candidate("dead_time", 0.08, 900.0)]
+    named = {f"{part.name}.{key}": q for part in parts for key, q in part.parameters.items()}
+    candidates = (
+        Candidate(candidate_name(NAMES), 0.7, 1900.0, named),
+        Candidate("dead_time", 0.08, 900.0),
+        Candidate("none", 0.02, 0.0),
+        Candidate("unknown", 0.2),
+    )
     log = LogFacts(rows=6000, segments=1, seconds=300.0, rate_hz=20.0, signals=("accel_cmd", "accel", "speed"))
     verdict = Verdict(budget.verdict, (candidate_name(NAMES),), abstained=False, why="They predict.")
-    return Diagnosis(log, {}, GapSize(True), tuple(shared_out(likelihood, budget, kinds)), verdict, budget=budget)
+    return Diagnosis(log, {}, GapSize(True), candidates, verdict, budget=budget)
 
 
 def test_the_answer_names_all_seven(seven: Diagnosis, tmp_path: Path) -> None:

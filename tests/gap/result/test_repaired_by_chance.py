@@ -1,4 +1,4 @@
-"""The repaired simulator after a selection on held-out blocks has what chance decides, too."""
+"""The repaired simulator has what chance decides, too."""
 
 from __future__ import annotations
 
@@ -7,18 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from avtorch import diagnose
 from avtorch.gap import Effect, Gust, SensorBias, plant
-from avtorch.gap.answer.budget import Budget, ChancePart, Unexplained
-from avtorch.gap.budget.repaired_model import with_chance
 from avtorch.gap.effects import Outliers
-from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.plant import GapPlant
-from tests.gap.budget.cars import DT, log_of
-from tests.gap.budget.test_slow_disturbance import coloured
+from tests.gap.cars import DT, log_of
 
 SD, TIME_S = 0.3, 3.0
 KINDS = ["sensor_bias", "dead_time", "gust"]
@@ -29,7 +25,9 @@ def pushed(effects: list[Effect]) -> Diagnosis:
     log = log_of(effects, seed=2)
     assert log.accel is not None
     assert log.speed is not None
-    force = coloured(np.random.default_rng(2), log.rows, SD, TIME_S, DT)
+    keep = np.exp(-DT / TIME_S)
+    kicks = np.random.default_rng(2).normal(0.0, SD * np.sqrt(1 - keep**2), log.rows)
+    force = np.asarray(lfilter([1.0], [1.0, -keep], kicks))
     windy = replace(log, accel=log.accel + force, speed=log.speed + np.cumsum(force) * DT)
     return diagnose(windy, effects=KINDS, posterior="laplace")
 
@@ -81,12 +79,21 @@ def test_a_gust_that_is_named_alone_has_a_repaired_simulator() -> None:
     assert found.shrinkage is None
 
 
-def test_outliers_are_in_units_of_the_sensors_noise_and_the_unlikely_is_left_out() -> None:
-    stated = {"fraction": Quantity(0.02, 0.0, 0.02, 0.02), "scale": Quantity(8.0, 0.0, 8.0, 8.0)}
-    chance = (ChancePart("outliers", 0.9, None, stated), ChancePart("gust", 0.4, None, {}))
-    share = Quantity(1.0, 0.0, 1.0, 1.0)
-    budget = Budget(1.0, 1.0, {}, (), Unexplained(share, material=False), {}, {}, chance=chance)
-    noise = NoiseModel(process_sd=0.05, process_time=0.5, accel_sd=0.07)
-    car = with_chance(plant([]), budget, [Outliers, Gust], noise)
-    assert car.effects == (Outliers(0.02, 8.0, noise_sd=0.07),)
-    assert float(car.sigma) == pytest.approx(0.05 * np.sqrt(2 / 0.5))
+@pytest.mark.slow
+def test_outliers_are_in_units_of_the_sensors_noise() -> None:
+    """Of a sensor with white noise, a sample in fifty is off by ten times its standard deviation."""
+    log, rng, sd = log_of([], noise=0.0), np.random.default_rng(4), 0.05
+    assert log.accel is not None
+    assert log.speed is not None
+    far = rng.random(log.rows) < 0.02
+    noise = sd * rng.standard_normal(log.rows) * np.where(far, 10.0, 1.0)
+    read = replace(log, accel=log.accel + noise, speed=log.speed + 0.01 * rng.standard_normal(log.rows))
+    found = diagnose(read, effects=["outliers", "sensor_bias"], pairs=False)
+    assert found.verdict.names == ("outliers",)
+    assert found.plant is not None
+    (effect,) = found.plant.effects
+    assert isinstance(effect, Outliers)
+    # 60 of them, half of which stand out: sizes to a quarter
+    assert effect.noise_sd == pytest.approx(sd, rel=0.15)
+    assert 0.5 < float(effect.fraction) / 0.02 < 1.5
+    assert 0.5 < float(effect.scale) / 10.0 < 2.0

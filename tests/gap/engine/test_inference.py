@@ -1,0 +1,195 @@
+"""The posterior over sets of effects, on drives of cars behind a recorder: what is there is found, what is not is not.
+
+Sizes are held to their own standard deviation by the suite's `BAR`. A delay may be off by the recorder's own lateness,
+too, which is known to a prior alone: that of `recorded_log` is some 20 ms more than the prior's mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from avtorch import diagnose
+from avtorch.blindtest import Car, simulate
+from avtorch.blindtest.drives import Recorded
+from avtorch.errors import InputError
+from avtorch.gap import DeadTime, SensorBias
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.inference import infer
+from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.simulator.effect import Effect
+from avtorch.io import Log
+from tests.bars import BAR
+from tests.gap.engine.recorded import recorded_log
+
+DELAY, BIAS, RECORDER_S = 0.25, 0.3, 0.02
+FEW = ("dead_time", "constant_resistance", "sensor_bias")
+TWO = ("dead_time", "constant_resistance")
+
+
+def found_in(log: Log, effects: Sequence[str | type[Effect]], **options: Any) -> Diagnosis:
+    return diagnose(log, effects=effects, **({"pairs": False} | options))
+
+
+def says(found: Diagnosis, name: str, truth: Mapping[str, float]) -> None:
+    """Names this cause, with its parameters."""
+    assert found.verdict.name == name
+    assert found.winner.probability > 0.5
+    for key, value in truth.items():
+        told = found.winner.parameters[key]
+        assert abs(told.mean - value) < BAR * told.sd + (RECORDER_S if "delay" in key else 0.0), key
+
+
+# what is there --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.statistical
+def test_none_stays_none(rotating_seed: int) -> None:
+    found = found_in(recorded_log(seed=rotating_seed), FEW)
+    # a likelihood ratio against what is true exceeds x nats in exp(-x) of all drives
+    assert all(c.log_evidence < 12 for c in found.candidates if c.log_evidence is not None)
+    assert not found.winner.effects
+    assert found.complete
+    assert sum(c.probability for c in found.candidates) == pytest.approx(1.0)
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize(
+    ("effect", "key"), [(DeadTime(DELAY), "delay_s"), (SensorBias(BIAS), "bias_mps2")], ids=["dead_time", "sensor_bias"]
+)
+def test_an_effect_is_found_with_its_size(effect: Effect, key: str, rotating_seed: int) -> None:
+    found = found_in(recorded_log([effect], seed=rotating_seed), FEW)
+    says(found, effect.name, {key: getattr(effect, key)})
+    assert found.onset_s is None
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+def test_a_cause_that_sets_in_is_found_with_its_onset(rotating_seed: int) -> None:
+    plain, biased = (recorded_log(e, seconds=60.0, seed=rotating_seed) for e in ((), (SensorBias(BIAS),)))
+    assert plain.accel is not None
+    assert biased.accel is not None
+    log = replace(plain, accel=np.where(plain.time > 32.0, biased.accel, plain.accel))
+    found = found_in(log, ["dead_time", "sensor_bias"])
+    says(found, "sensor_bias", {"bias_mps2": BIAS})
+    # six times the noise of a row: two rows tell it, and frames of some seconds hold it
+    assert found.onset_s == pytest.approx(32.0, abs=1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+def test_a_pair_is_found(rotating_seed: int) -> None:
+    log = recorded_log([DeadTime(DELAY), SensorBias(BIAS)], seconds=60.0, seed=rotating_seed)
+    truth = {"dead_time.delay_s": DELAY, "sensor_bias.bias_mps2": BIAS}
+    says(found_in(log, FEW, pairs=True), "dead_time+sensor_bias", truth)
+    # and none is looked for unless asked
+    assert all(len(c.effects) < 2 for c in found_in(log, FEW).candidates)
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+def test_outliers_are_found_beside_a_bias(rotating_seed: int) -> None:
+    """Thirty samples with ten times the noise, of which a third are larger than ten times it."""
+    log, rng = recorded_log([SensorBias(BIAS)], seconds=60.0, seed=rotating_seed), np.random.default_rng(rotating_seed)
+    assert log.accel is not None
+    far = rng.choice(log.rows, 30, replace=False)
+    accel = log.accel.copy()
+    accel[far] += 0.5 * rng.standard_normal(30)
+    found = found_in(replace(log, accel=accel), ["outliers", "sensor_bias", "dead_time"], pairs=True)
+    assert set(found.verdict.names) == {"outliers", "sensor_bias"}
+    told = found.winner.parameters["sensor_bias.bias_mps2"]
+    assert abs(told.mean - BIAS) < BAR * told.sd
+    assert "outliers" not in found_in(log, ["outliers", "sensor_bias"], pairs=True).verdict.names
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+def test_lost_messages_are_found(rotating_seed: int) -> None:
+    """Of the reference vehicle, which shares no code with this, under a demand that moves twice a second."""
+    rng = np.random.default_rng(rotating_seed)
+    command = np.repeat(rng.uniform(-1.5, 1.5, 120), 10)
+    for effects, there in (({"command_hold": {"hold_fraction": 0.4}}, True), ({}, False)):
+        run = simulate(
+            Car(), Recorded(command, start_speed=25.0), seconds=60.0, rate_hz=20, effects=effects, seed=rotating_seed
+        )
+        log = Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed)
+        assert ("command_hold" in found_in(log, ["command_hold", "dead_time"]).verdict.names) == there
+
+
+# what is asked --------------------------------------------------------------------------------------------------------
+
+
+def test_weights_of_causes_multiply(fresh_seed: int) -> None:
+    data = DriveData.of(recorded_log(seconds=20.0, seed=fresh_seed))
+    # what is less probable than 1e-4 is listed with that: weights large enough that nothing is
+    given = {"dead_time": 1e5, "unknown": 1e3}
+    more = given | {"unknown": 3e3}
+    plain, told = (infer(data, effects=TWO, most=1, prior=p).average.probabilities for p in (given, more))
+    assert told["unknown"] / told["none"] == pytest.approx(3 * plain["unknown"] / plain["none"])
+    barred = infer(data, effects=TWO, most=1, prior={"dead_time": 0.0}).average.probabilities
+    assert "dead_time" not in barred
+    assert sum(barred.values()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        ({"dead_time": -1.0}, "prior: found -1.0 for dead_time"),
+        ({"dead_time": float("nan")}, "prior: found nan for dead_time"),
+        ({"none": float("inf")}, "prior: found inf for none"),
+        ({"sensor_lag": 1.0}, "prior: found 'sensor_lag', needs one of"),  # not among the effects
+    ],
+)
+def test_weights_that_are_none_are_refused(prior: dict[str, float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        found_in(recorded_log(seconds=15.0), TWO, prior=prior)
+
+
+def test_a_search_out_of_time_reports_it(fresh_seed: int) -> None:
+    found = found_in(recorded_log([DeadTime(DELAY)], seconds=20.0, seed=fresh_seed), TWO, budget_s=0.0)
+    assert not found.complete
+    assert "unknown" in found.verdict.alias_set
+    assert found.scope is not None
+    assert found.to_dict()["complete"] is False
+
+
+@pytest.mark.slow
+def test_the_same_log_gets_the_same_answer(fresh_seed: int) -> None:
+    log = recorded_log([DeadTime(DELAY)], seconds=30.0, seed=fresh_seed)
+    assert found_in(log, FEW).to_dict() == found_in(log, FEW).to_dict()
+
+
+# what recorders write -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+@pytest.mark.parametrize("kept", ["accel", "speed"])
+def test_one_channel_shows_a_delay(kept: str, rotating_seed: int) -> None:
+    log = recorded_log([DeadTime(0.5)], seconds=90.0, seed=rotating_seed)
+    blind = replace(log, speed=None) if kept == "accel" else replace(log, accel=None)
+    found = found_in(blind, TWO)
+    # below 1.3 Hz a second pole of the actuator looks alike: it is not among the effects
+    assert "dead_time" in found.verdict.alias_set
+    told = next(c for c in found.candidates if c.name == "dead_time").parameters["delay_s"]
+    assert abs(told.mean - 0.5) < BAR * told.sd
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+def test_a_speed_in_whole_kmh_is_read(rotating_seed: int) -> None:
+    log = recorded_log([DeadTime(DELAY)], seconds=60.0, seed=rotating_seed)
+    assert log.speed is not None
+    says(found_in(replace(log, speed=np.round(3.6 * log.speed) / 3.6), TWO), "dead_time", {"delay_s": DELAY})
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+@pytest.mark.parametrize("rate_hz", [10, 200])
+def test_slow_and_fast_recorders_are_read(rate_hz: int, rotating_seed: int) -> None:
+    log = recorded_log([DeadTime(DELAY)], seconds=60.0, rate_hz=rate_hz, seed=rotating_seed)
+    says(found_in(log, TWO), "dead_time", {"delay_s": DELAY})

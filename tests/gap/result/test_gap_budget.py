@@ -1,0 +1,84 @@
+"""The budget divides the gap among what was put in; noise that has a colour is no cause."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from avtorch.errors import InputError
+from avtorch.gap import Budget, ConstantResistance, DeadBand, DeadTime, Effect, SensorBias, gap_budget
+from tests.gap.cars import log_of
+
+FEW = ["dead_time", "dead_band", "constant_resistance", "sensor_bias", "sensor_scale"]
+
+
+def sums_to_one(budget: Budget) -> None:
+    shares = [part.share.mean for part in budget.parts]
+    assert sum(shares) + budget.unexplained.share.mean == pytest.approx(1.0, abs=1e-9)
+    assert shares == sorted(shares, reverse=True)
+    for part in budget.parts:
+        assert part.name in part.alias_set
+        assert part.share.q05 <= part.share.mean <= part.share.q95
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("effect", "key", "within"),
+    [
+        # a few per cent of each: 150 s, noise of 0.05 m/s² that lasts 1.5 s
+        (ConstantResistance(0.2), "resistance_mps2", 0.05),
+        (DeadBand(0.25), "half_width_mps2", 0.06),
+        (DeadTime(0.3), "delay_s", 0.06),
+        (SensorBias(0.2), "bias_mps2", 0.05),
+    ],
+    ids=lambda x: getattr(x, "name", None),
+)
+def test_a_single_cause_is_the_whole_budget(effect: Effect, key: str, within: float, fresh_seed: int) -> None:
+    budget = gap_budget(log_of([effect], seed=fresh_seed), effects=FEW)
+    assert budget.names == (effect.name,)
+    part = budget.parts[0]
+    assert part.parameters[key].mean == pytest.approx(getattr(effect, key), abs=within)
+    assert part.share.mean > 0.85
+    assert part.onset_s is None
+    sums_to_one(budget)
+
+
+@pytest.mark.slow
+def test_parts_and_what_is_unexplained_sum_to_one(fresh_seed: int) -> None:
+    log = log_of([ConstantResistance(0.2), SensorBias(0.2), DeadBand(0.25)], seed=fresh_seed)
+    budget = gap_budget(log, effects=FEW)
+    assert set(budget.names) == {"constant_resistance", "sensor_bias", "dead_band"}
+    sums_to_one(budget)
+    assert budget.before > budget.left >= 1.0
+    assert "constant_resistance" in str(budget)
+
+
+def test_without_a_cause_all_is_unexplained() -> None:
+    budget = gap_budget(log_of(seconds=40.0), effects=["dead_time"])
+    sums_to_one(budget)
+    assert budget.parts == ()
+    assert budget.unexplained.share.mean == 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(4))
+def test_coloured_noise_is_no_cause(number: int, fresh_seed: int) -> None:
+    budget = gap_budget(log_of(seed=fresh_seed + number), effects=FEW)
+    assert budget.names == ()
+
+
+@pytest.mark.slow
+def test_the_same_log_has_the_same_budget(fresh_seed: int) -> None:
+    log = log_of([DeadBand(0.25)], seed=fresh_seed, seconds=60.0)
+    assert gap_budget(log, effects=FEW).to_dict() == gap_budget(log, effects=FEW).to_dict()
+
+
+def test_wrong_arguments_are_refused() -> None:
+    log = log_of(seconds=60.0)
+    for material in (0.0, 1.0, float(np.nan)):
+        with pytest.raises(InputError, match="material"):
+            gap_budget(log, material=material)
+    with pytest.raises(InputError, match="perhaps dead_time"):
+        gap_budget(log, effects=["dead_tim"])
+    with pytest.raises(InputError, match="needs 12 s"):
+        gap_budget(log_of(seconds=7.0), effects=FEW)
