@@ -4,11 +4,9 @@ The car: `T_L` and `K_L` are fitted to each set. Their spread between drives of 
 the drives, each of which contributes its own score (the sandwich estimator of White 1982), and is never less than the
 posterior's. Differences that a missing effect causes between manoeuvres therefore count as spread, not as a change.
 
-Where `T_L` or `K_L` differ, a change of dead time is tested as a rival explanation (`dead_time_or_lag`), because it
-resembles a longer lag.
-
-The cause: T_L alone, K_L alone, dead time, or an effect of the table, whichever explains the drives after best on top
-of what both sides share (`change.change_cause`).
+The cause: T_L alone, K_L alone, dead time, or an effect of the table, whichever explains the drives after best in one
+model of both sides that shares all the rest (`engine.joint`). Where `T_L` or `K_L` differ, the same model tells a
+change of dead time, which resembles a longer lag, from one of lag and gain.
 
 The simulator: rollout errors over both sets, and their ratio over bootstrapped blocks.
 """
@@ -16,7 +14,6 @@ The simulator: rollout errors over both sets, and their ratio over bootstrapped 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from os import PathLike
 
 import numpy as np
@@ -29,17 +26,15 @@ from avtorch.errors import InputError
 from avtorch.gap.answer.change import ChangeCause
 from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.blocks import FEWEST_BLOCKS, blocks_of
-from avtorch.gap.change.change_cause import cause_of_change
-from avtorch.gap.change.two_sides import TwoSides
-from avtorch.gap.dead_time_or_lag import DeadTimeFit, compare_explanations
 from avtorch.gap.drive_record import Record
-from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.joint import JointModel
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.cause_of_change import cause_of_change, dead_time_test
 from avtorch.gap.result.comparison import Change, Comparison, DeadTimeTest, SimulatorChange
 from avtorch.gap.result.diagnosis import LogFacts
+from avtorch.gap.result.lag_and_gain import CAR, LagAndGain
 from avtorch.gap.rollout_errors import HORIZON_S, RolloutMetric, block_squares, reached, rolled_out
-from avtorch.gap.search.fitted_model import FittedModel
-from avtorch.gap.search.search import Search
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.effect_choice import chosen_effects
 from avtorch.gap.simulator.plant import GapPlant, plant
@@ -53,7 +48,6 @@ LEVEL = 0.04
 _DRAWS = 2000
 _HORIZONS = (HORIZON_S, 5.0, 2.0, 1.0)
 _WHOLE_SHARE = 0.4  # of a side's rows that have a whole rollout behind them
-_CAR = ("T_L", "K_L")
 
 
 @shows_progress
@@ -110,16 +104,16 @@ def compare(
     plants = [b if isinstance(b, GapPlant) else plant([], baseline=b) for b in given]
     if told is not None:
         told("lag and gain of both drives", 0, 2)
-    fitted = [_Side.of(logs, plants[0], name) for logs, name in zip(sides, ("before", "after"), strict=True)]
+    fitted = [LagAndGain.of(logs, plants[0], name) for logs, name in zip(sides, ("before", "after"), strict=True)]
     one, two = fitted
-    if one.found.hypothesis.record.channels != two.found.hypothesis.record.channels:
+    if one.record.channels != two.record.channels:
         raise InputError("before, after: have different channels; needs accel, speed or both in both")
     away = two.mean - one.mean
     covariance = one.covariance + two.covariance
     blocks = min(one.blocks, two.blocks)
     # Hotelling's test: two parameters, spreads estimated from this many blocks
     square = float(away @ np.linalg.solve(covariance, away))
-    count = len(_CAR)
+    count = len(CAR)
     statistic = square * (blocks - count) / (count * (blocks - 1))
     p_value = float(fisher.sf(statistic, count, blocks - count))  # pyright: ignore[reportUnknownMemberType]
     sure = float(student.ppf(0.95, blocks - 1))  # pyright: ignore[reportUnknownMemberType]
@@ -129,20 +123,19 @@ def compare(
             Quantity.of_logarithm(two.mean[i], two.covariance[i, i], sure),
             Quantity.of_logarithm(away[i], covariance[i, i], sure),
         )
-        for i, name in enumerate(_CAR)
+        for i, name in enumerate(CAR)
     }
-    simulators = [p if b is not None else _as_fitted(one.found) for p, b in zip(plants, given, strict=True)]
+    simulators = [p if b is not None else one.fitted(plants[0]) for p, b in zip(plants, given, strict=True)]
     same = all(x is y or _alike(x, y) for x, y in zip(*sides, strict=False)) and len(sides[0]) == len(sides[1])
     horizon = _horizon(fitted)
     gap = _gaps(fitted, simulators, horizon, same=same)
     simulator = _simulator_change(gap)
     changed = p_value < level
-    cause = None if same else _cause(sides, plants[0], kinds, told)
-    dead_time_test = (
-        compare_explanations(*(DeadTimeFit.of(x.search.fits, x.found) for x in fitted), level=level)
-        if changed
-        else None
-    )
+    cause, of_two = None, None
+    model = None if same else _joint(sides, plants[0], told)
+    if model is not None:
+        cause = cause_of_change(model, kinds, progress=told)
+        of_two = dead_time_test(model) if changed else None
     return Comparison(
         before=LogFacts.of(sides[0]),
         after=LogFacts.of(sides[1]),
@@ -152,70 +145,24 @@ def compare(
         changed=changed,
         simulator=simulator,
         why=_sentence(
-            car, p_value, simulator, dead_time_test, cause, same=same, simulators=1 + (given[0] is not given[1])
+            car, p_value, simulator, changed, of_two, cause, same=same, simulators=1 + (given[0] is not given[1])
         ),
-        dead_time_test=dead_time_test,
+        dead_time_test=of_two,
         cause=cause,
         horizon_s=horizon,
     )
 
 
-def _cause(
-    sides: Sequence[Sequence[Log]],
-    base: GapPlant,
-    kinds: Sequence[type[Effect]],
-    progress: Callable[[str, int, int], None] | None,
-) -> ChangeCause | None:
-    """None where the drives, long enough for lag and gain, are too short for it: stretches below 8 s do not count."""
+def _joint(
+    sides: Sequence[Sequence[Log]], base: GapPlant, told: Callable[[str, int, int], None] | None
+) -> JointModel | None:
+    """None where the drives, long enough for lag and gain, are too short for a cause."""
+    if told is not None:
+        told("one model of both drives", 1, 2)
     try:
-        both = TwoSides.of(*sides)
+        return JointModel.of(DriveData.of([*sides[0], *sides[1]]), len(sides[0]), base)
     except InputError:
         return None
-    return cause_of_change(both, base, kinds, progress=progress)
-
-
-@dataclass(frozen=True, eq=False)
-class _Side:
-    """One set of drives: `mean` and `covariance` of ln T_L and ln K_L, estimated from `blocks` blocks."""
-
-    search: Search = field(repr=False)
-    found: FittedModel
-    mean: FloatArray
-    covariance: FloatArray = field(repr=False)
-    blocks: int
-
-    @classmethod
-    def of(cls, logs: Sequence[Log], base: GapPlant, which: str) -> _Side:
-        search = Search(logs, base, effects=[], pairs=False)
-        found = search.run().none
-        record = found.hypothesis.record
-        blocks = blocks_of(record, fewest=FEWEST_BLOCKS)
-        if len(blocks) < FEWEST_BLOCKS:
-            raise InputError(
-                f"{which}: found {len(blocks)} blocks of 4 s of usable driving, needs {FEWEST_BLOCKS} or more"
-            )
-        columns = whitened_jacobian(found.hypothesis, found.white, found.z).reshape(len(found.z), -1)
-        # derivative of the errors: minus that of the rollout
-        pulls = -columns * found.white(found.errors).ravel()
-        shape = (len(found.z), len(record.channels), record.rows, record.group)
-        by_row = pulls.reshape(shape).sum((1, 3))
-        scores = np.stack([by_row[:, b].sum(1) for b in blocks], 1)
-        scores = scores - scores.mean(1, keepdims=True)
-        between = scores @ scores.T * len(blocks) / (len(blocks) - 1)
-        root = np.linalg.cholesky(found.covariance)
-        # in coordinates that whiten the posterior: the spread is no smaller than the posterior's in any direction
-        sizes, axes = np.linalg.eigh(root.T @ between @ root)
-        spread = root @ axes @ np.diag(np.maximum(sizes, 1.0)) @ axes.T @ root.T
-        here = np.array([np.log(found.values[name]) for name in _CAR])
-        step = 1e-4
-        each = found.hypothesis.values(found.z + step * np.eye(len(found.z)))
-        slope = np.stack([(np.log(each[name].numpy()) - here[i]) / step for i, name in enumerate(_CAR)])
-        return cls(search, found, here, slope @ spread @ slope.T, len(blocks))
-
-
-def _as_fitted(found: FittedModel) -> GapPlant:
-    values = {name: found.values[name] for name in _CAR}
-    return found.hypothesis.baseline.with_values(values)
 
 
 def _alike(one: Log, two: Log) -> bool:
@@ -224,13 +171,13 @@ def _alike(one: Log, two: Log) -> bool:
     return all(a is b if a is None or b is None else np.array_equal(a, b) for a, b in signals)
 
 
-def _horizon(sides: Sequence[_Side]) -> float:
+def _horizon(sides: Sequence[LagAndGain]) -> float:
     """Length of the rollouts [s], up to `HORIZON_S`, that fits the stretches of both sides: errors grow with it.
 
     The longest of which both sides hold enough that is whole. A rollout that begins with its stretch is shorter, and of
     many overrides most would be.
     """
-    records = [side.found.hypothesis.record for side in sides]
+    records = [side.record for side in sides]
     for horizon in _HORIZONS:
         if all(_rows_of(_whole(record, horizon)) > _WHOLE_SHARE * record.rows for record in records):
             return horizon
@@ -251,12 +198,14 @@ def _rows_of(blocks: Sequence[slice]) -> int:
     return sum(block.stop - block.start for block in blocks)
 
 
-def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float, *, same: bool) -> dict[str, Change]:
+def _gaps(
+    sides: Sequence[LagAndGain], simulators: Sequence[GapPlant], horizon: float, *, same: bool
+) -> dict[str, Change]:
     """Rollout errors before and after, by metric; both sides use the same bootstrap draws for the `same` drives."""
     drawn: list[dict[str, FloatArray]] = []
     for i, (side, simulator) in enumerate(zip(sides, simulators, strict=True)):
         rng = np.random.default_rng(0 if same else i)
-        record = side.found.hypothesis.record
+        record = side.record
         errors = record.measured - rolled_out(record, simulator)
         blocks = _whole(record, horizon) or blocks_of(record, fewest=FEWEST_BLOCKS)
         squares = block_squares(record, errors, blocks, float(simulator.T_L), horizon)
@@ -287,7 +236,8 @@ def _sentence(
     car: Mapping[str, Change],
     p_value: float,
     simulator: SimulatorChange,
-    dead_time_test: DeadTimeTest | None,
+    changed: bool,
+    of_two: DeadTimeTest | None,
     cause: ChangeCause | None,
     *,
     same: bool,
@@ -296,15 +246,15 @@ def _sentence(
     if same and simulators == 1:
         return "Both sides are the same drive and the same simulator: there is nothing to compare."
     if same:
-        of_two = {"closer": "The second simulator is closer", "farther": "The second simulator is farther from it"}
-        return f"One drive, two simulators. {of_two.get(simulator, 'Neither simulator is measurably closer to it')}."
+        two = {"closer": "The second simulator is closer", "farther": "The second simulator is farther from it"}
+        return f"One drive, two simulators. {two.get(simulator, 'Neither simulator is measurably closer to it')}."
     numbers = ", ".join(
         f"{name} {car[name].before.mean:.2f} to {car[name].after.mean:.2f}{unit}"
         for name, unit in (("T_L", " s"), ("K_L", ""))
     )
     # what all effects were tried for is not said again of two of them
     named = cause is not None and bool(cause.parts)
-    first = _explanation(numbers, f"p = {p_value:.2g}", dead_time_test, named=named)
+    first = _explanation(numbers, f"p = {p_value:.2g}", changed, of_two, named=named)
     words = {
         "closer": "the drives after are closer to the simulator",
         "farther": "the drives after are farther from the simulator",
@@ -316,23 +266,25 @@ def _sentence(
     return f"{first}; {words[simulator]}. {last}"
 
 
-def _explanation(numbers: str, chance: str, dead_time_test: DeadTimeTest | None, *, named: bool) -> str:
+def _explanation(numbers: str, chance: str, changed: bool, of_two: DeadTimeTest | None, *, named: bool) -> str:
     """The sentence on lag and gain: they are stated as the explanation only where dead time is none."""
-    if dead_time_test is None:
+    if not changed:
         first = "T_L and K_L alone show no change" if named else "No change of the car is detected"
         return f"{first}: {numbers} ({chance})"
     if named:
         return f"The car has changed: as GLVD without any effect, {numbers} ({chance})"
-    delays = " to ".join(f"{max(q.mean, 0.0):.2f}" for q in (dead_time_test.before, dead_time_test.after))
-    if dead_time_test.explanation == "lag and gain":
-        more = f"a change of dead time alone does not explain it (p = {dead_time_test.p_dead_time:.2g})"
+    if of_two is None:
+        return f"The car has changed: {numbers} ({chance})"
+    delays = " to ".join(f"{max(q.mean, 0.0):.2f}" for q in (of_two.before, of_two.after))
+    if of_two.explanation == "lag and gain":
+        more = f"that the dead time has changed instead or too has probability {1 - of_two.p_lag_gain:.2g}"
         return f"The car has changed: {numbers} ({chance}); {more}"
-    if dead_time_test.explanation == "not distinguishable":
+    if of_two.explanation == "not distinguishable":
         return (
             f"The car has changed ({chance}), but these drives cannot distinguish a change of lag and gain ({numbers}) "
-            f"from one of dead time ({delays} s, p = {dead_time_test.p_dead_time:.2g})"
+            f"from one of dead time ({delays} s, probability {1 - of_two.p_lag_gain:.2g})"
         )
     return (
-        f"The car has changed ({chance}), but lag and gain do not explain it (p = {dead_time_test.p_lag_gain:.2g}): "
+        f"The car has changed ({chance}), but lag and gain do not explain it (probability {of_two.p_lag_gain:.2g}): "
         f"a dead time fitted as well goes from {delays} s, and without one they would be {numbers}"
     )

@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from io import StringIO
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,18 +18,17 @@ from avtorch.cli.compare import _table
 from avtorch.errors import InputError
 from avtorch.gap import ConstantResistance, DeadTime, Effect, SensorBias, plant
 from avtorch.gap.answer.change import ChangeCause, ChangePart, detectable_text
-from avtorch.gap.change import change_selection
-from avtorch.gap.change.change_cause import cause_of_change
-from avtorch.gap.change.change_model import Change, ChangeModel, changes
-from avtorch.gap.change.change_selection import Step, _again, _noise, _without_the_redundant
-from avtorch.gap.change.two_sides import TwoSides
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.joint import JointModel, block_scores, of_car
+from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.cause_of_change import cause_of_change
 from avtorch.gap.result.comparison import Comparison
 from avtorch.gap.result.diagnosis import LogFacts
 from avtorch.io import Log
 from avtorch.report import comparison_html
 from tests.bars import LEVEL, student
-from tests.gap.budget.cars import log_of
+from tests.gap.cars import log_of
 
 KINDS: list[type[Effect]] = [ConstantResistance, SensorBias]
 T_L, K_L = 0.35, 0.95
@@ -58,7 +56,11 @@ CASES = {
 
 
 def _cause(before: Log, after: Log) -> ChangeCause:
-    return cause_of_change(TwoSides.of([before], [after]), plant([]), KINDS)
+    return cause_of_change(_model(before, after), KINDS)
+
+
+def _model(before: Log, after: Log) -> JointModel:
+    return JointModel.of(DriveData.of([before, after]), 1, plant([]))
 
 
 def _pair(case: Case, seed: int, both: Sequence[Effect] = ()) -> tuple[Log, Log]:
@@ -124,39 +126,36 @@ def test_what_is_gone_has_the_opposite_sign(rotating_seed: int) -> None:
     assert str(part).startswith("less constant_resistance (resistance -")
 
 
-@pytest.mark.slow
-def test_a_change_that_leaves_keeps_the_later_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lag, entered first by force and made to leave: gain and bias stay, in order, with gains of their own."""
-    monkeypatch.setattr(change_selection, "_STAYS", np.inf)
-    sides = TwoSides.of([log_of(seconds=40.0, seed=1)], [log_of([SensorBias(0.3)], seconds=40.0, seed=2, K_L=0.7)])
-    base = plant([])
-    fitting, start = _noise(sides, base, None)
-    known = {change.name: change for change in changes(KINDS, base, sides)}
-    steps = [Step(start, fitting.hold_out(start))]
-    for name in ("T_L", "K_L", "sensor_bias"):
-        model = steps[-1].fit.model.with_change(known[name])
-        fit = fitting.fit(model, model.starts(steps[-1].fit.model.named(steps[-1].fit.p)))
-        steps.append(_again(sides, fitting, steps[-1], Step(fit, steps[-1].held, known[name]), fit))
-    left = _without_the_redundant(sides, fitting, steps)
-    assert [step.change.name for step in left[1:] if step.change is not None] == ["K_L", "sensor_bias"]
-    assert [step.fit.model.names for step in left] == [(), ("K_L",), ("K_L", "sensor_bias")]
-    for before, step in pairwise(left):
-        assert step.gains is not None
-        assert step.gains == pytest.approx(before.held.nats - step.held.nats)
-
-
 def test_both_sides_share_what_has_not_changed() -> None:
-    sides = TwoSides.of(*([log_of(seconds=60.0, seed=seed)] for seed in (1, 2)))
-    model = ChangeModel(sides, plant([])).with_change(Change("K_L", "K_L"))
-    p = model.coordinates({"T_L": np.array([0.3]), "K_L": np.array([0.2]), "after.K_L": np.array([-0.5])})
-    before, after = (model.before.named(model.of_side(p, after=side)) for side in (False, True))
-    assert before["T_L"] == after["T_L"] == 0.3
-    assert before["K_L"] == 0.2
-    assert after["K_L"] == -0.5
-    # nothing changes where the gain after is that before
-    same = model.coordinates({"T_L": np.array([0.3]), "K_L": np.array([0.2])})
-    assert model.difference(same) == pytest.approx(0.0, abs=1e-12)
-    assert np.abs(model.difference(p)).max() > 0.1
+    model = _model(*(log_of(seconds=60.0, seed=seed) for seed in (1, 2)))
+    gain = of_car("K_L")
+    x = np.append(model.start.x, -0.3)
+    fit = model.at((gain,), x)
+    before, after = fit.sides
+    assert before["T_L"] == after["T_L"]
+    assert before["dead_time"] == after["dead_time"]
+    assert after["K_L"] == pytest.approx(before["K_L"] * np.exp(-0.3))
+    # the sides are those rows of both drives, in the same coefficients
+    rows = model.whole.log == 1
+    assert np.array_equal(model.sides[1].command, model.whole.command[rows])
+    assert sum(side.frame_count for side in model.sides) == model.whole.frame_count
+    same = model.at((gain,), np.append(model.start.x, 0.0))
+    assert same.objective == pytest.approx(model.start.objective, abs=1.0)
+    assert fit.objective < same.objective - 10
+
+
+def test_scores_of_blocks_add_up_to_the_gradient() -> None:
+    """The transform is orthonormal: what rows of a block say of a coordinate sums to what the coefficients say."""
+    model = _model(*(log_of(seconds=60.0, seed=seed) for seed in (1, 2)))
+    fit = model.start
+    for k, h in enumerate(fit.sides):
+        left = model.left(fit, h)
+        each = block_scores(h, fit.noise[k], fit.derivatives[k], left)
+        white = whiten(h.data, fit.noise[k], left)
+        whole = [whiten(h.data, fit.noise[k], d) @ white for d in fit.derivatives[k]]
+        scale = [np.linalg.norm(whiten(h.data, fit.noise[k], d)) for d in fit.derivatives[k]]
+        # rows at the ends of a stretch are under one frame only
+        assert each.sum(1) == pytest.approx(whole, abs=1e-6 + 3.0 * max(scale))
 
 
 # the form of the answer ----------------------------------------------------------------------------------------------
@@ -251,9 +250,9 @@ def test_candidates_that_are_no_effects(effects: Sequence[str], message: str) ->
 
 def test_a_side_too_short_for_a_cause() -> None:
     long, short = log_of(seconds=60.0), log_of(seconds=20.0)
-    for sides, name in ((([short], [long]), "before"), (([long], [short]), "after")):
-        with pytest.raises(InputError, match=rf"{name}: found \d blocks of 4 s of usable driving, needs 5 or more"):
-            TwoSides.of(*sides)
+    for sides, name in (((short, long), "before"), ((long, short), "after")):
+        with pytest.raises(InputError, match=rf"{name}: found \d frames, needs 3 or more"):
+            _model(*sides)
 
 
 @pytest.mark.slow
