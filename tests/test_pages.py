@@ -16,7 +16,7 @@ ALL = [DOCS.parent / "README.md", *sorted(DOCS.glob("*.md")), *sorted(DOCS.glob(
 # with tests of their own: tests/gap/simulator/test_own_effect_page.py, tests/test_gallery.py, tests/test_tutorial.py
 ELSEWHERE = ("gallery.md", "own-effect.md", "tutorial.md")
 CODE = [p.name for p in ALL[1:] if "```python" in p.read_text(encoding="utf-8") and p.name not in ELSEWHERE]
-SLOW = ("blindtest.md", "budget.md", "coming-from.md", "compare.md", "diagnosis.md", "fleet.md", "fmu.md")
+SLOW = ("blindtest.md", "coming-from.md", "compare.md", "diagnosis.md", "fleet.md", "fmu.md")
 SLOW += ("followers.md", "pedals.md", "simulators.md")
 COMMANDS = {"diagnosis.md": "diagnose", "followers.md": "diagnose"}
 

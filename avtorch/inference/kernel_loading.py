@@ -1,4 +1,4 @@
-"""Modules of compiled loops (numba, the extra ``avtorch[fast]``), or why they cannot be had."""
+"""Modules of compiled loops (numba), or why they cannot be had."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The SGLD walk, and the check of its draws, as compiled loops (numba, the extra ``avtorch[fast]``).
+"""The SGLD walk, and the check of its draws, as compiled loops (numba).
 
 What a step does is that of :class:`~avtorch.inference.sgld.SGLD`; the density is an
 :class:`~avtorch.inference.exponential_form.ExponentialForm`. A chain's noise is a function of seed, window, chain and

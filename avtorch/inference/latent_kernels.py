@@ -1,4 +1,4 @@
-"""The latent log likelihood as a compiled loop over rows (numba, the extra ``avtorch[fast]``), even and uneven alike.
+"""The latent log likelihood as a compiled loop over rows (numba), even and uneven alike.
 
 The law is that of :mod:`~avtorch.inference.latent_model`, the recursion that of
 :mod:`~avtorch.inference.latent_filter`, written out for the state ``(v, a, c, e)`` whose two halves move apart: of the

@@ -1,1 +1,0 @@
-"""The posterior of a fitted model: its density, draws by SGLD, summaries."""

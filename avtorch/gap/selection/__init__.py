@@ -1,1 +1,0 @@
-"""Which hypothesis a log supports: probabilities, adequacy, alias sets, the verdict."""
