@@ -14,7 +14,7 @@ from torch import Tensor
 
 from avtorch.arrays import Float
 from avtorch.errors import InputError
-from avtorch.gap.likelihood.basis import lowpass
+from avtorch.gap.likelihood.grade_marginal import GradeMarginal
 from avtorch.inference import JerkStatistics
 from avtorch.inference.estimators.state_model import GaussianState
 from avtorch.vehicle import Block
@@ -87,9 +87,10 @@ def test_the_fields_of_a_named_tuple_are_under_the_check() -> None:
 
 
 def test_likelihood_is_under_the_check() -> None:
-    lowpass(np.zeros(5), 1.0, 0.1)
-    with pytest.raises(ShapeError, match="lowpass, x"):
-        lowpass(np.zeros((3, 5)), 1.0, 0.1)
+    marginal = GradeMarginal.of(np.eye(2, 5))
+    marginal.by_size(np.zeros((3, 2)))
+    with pytest.raises(ShapeError, match="match"):
+        marginal.by_size(np.zeros(2))
 
 
 ROOT = Path(__file__).resolve().parents[1] / "avtorch"

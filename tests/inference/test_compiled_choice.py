@@ -95,7 +95,7 @@ def test_without_numba_the_reference_walks(make_windows, monkeypatch):
     load_kernels.cache_clear()
     try:
         assert torch.equal(sample(density, SamplerSettings(chains=64), generator=generator(1)).draws, eager)
-        with pytest.raises(InputError, match=r"numba is not installed: pip install 'avtorch\[fast\]'"):
+        with pytest.raises(InputError, match="numba is not installed: pip install numba"):
             sample(density, SamplerSettings(walk="compiled"))
     finally:
         load_kernels.cache_clear()
