@@ -249,7 +249,7 @@ def test_candidates_that_are_no_effects(effects: Sequence[str], message: str) ->
 
 
 def test_a_side_too_short_for_a_cause() -> None:
-    long, short = log_of(seconds=60.0), log_of(seconds=20.0)
+    long, short = log_of(seconds=60.0), log_of(seconds=16.0)
     for sides, name in (((short, long), "before"), ((long, short), "after")):
         with pytest.raises(InputError, match=rf"{name}: found \d frames, needs 3 or more"):
             _model(*sides)

@@ -501,7 +501,9 @@ def block_scores(h: Hypothesis, noise: FloatArray, derivatives: FloatArray, left
 def blocks_of(data: DriveData) -> list[slice]:
     """Rows under the frames, in blocks of 10 s; in shorter ones where there are less than five."""
     covered = [(i, i + (n + 1) * data.frame_rows) for i, n in data.frames]
-    seconds = min(_BLOCK_S, sum(j - i for i, j in covered) * data.dt / _FEWEST_BLOCKS - 1e-6)
+    seconds = _BLOCK_S
+    while sum(max(1, int((j - i) * data.dt / seconds)) for i, j in covered) < _FEWEST_BLOCKS:
+        seconds *= 0.9
     out = []
     for i, j in covered:
         edges = np.linspace(i, j, max(1, int((j - i) * data.dt / seconds)) + 1).round().astype(int).tolist()
