@@ -2,8 +2,8 @@
 
 The simulator is driven at its present values and beside each of them, and taken for linear between: `n + 1` times for
 `n` parameters, and again at the better values, until these stay where they are. Slow simulators are asked seldom, and
-never twice for the same values. Whether other values are needed at all is decided as it is for effects: by blocks of
-the drives that the fit has not seen (`RobustFit.evidence`).
+never twice for the same values. Whether other values are needed at all is decided as it is for effects, by evidence,
+and at their price (`LinearFit.evidence_over`): the recorder may be late and the noise of any colour either way.
 """
 
 from __future__ import annotations
@@ -17,12 +17,10 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed
+from avtorch.external.linear_response import LinearFit, LinearResponse, rows_of
 from avtorch.external.parameters import Limits
-from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.effect_model import LATENESS, LATENESS_S
-from avtorch.gap.budget.flexible_regression import left_over
-from avtorch.gap.budget.noise_whitening import NoiseWhitening
-from avtorch.gap.budget.robust_fit import Fit, HeldOut, RobustFit
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.priors import EFFECT_NATS, ONE_CHANNEL_HZ
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.simulator_under_test import ParameterDifference
 from avtorch.io import Log
@@ -39,7 +37,7 @@ Values = Mapping[str, float]
 class Adjusted:
     """The simulator's `outputs` by drive with the values that fit the car.
 
-    `parameters`: what it had, and what the car has; they differ where blocks held out agree that other values are
+    `parameters`: what it had, and what the car has; they differ where the evidence says that other values are
     needed. `rollouts`: how many times the car's drives were driven through.
     """
 
@@ -101,36 +99,28 @@ def adjusted(rollouts: Rollouts, limits: Limits, *, logs: Sequence[Log] | None =
     """
     before = rollouts.start
     first = rollouts.at(before)
-    cars = [replace(log, engaged=out.engaged) for log, out in zip(logs or rollouts.logs, first, strict=True)]
-    record = AnalysisRecord.for_budget(cars)
-    model = _Linear.around(record, cars, rollouts, before, limits)
-    fitting = _fitting(record, model)
-    fit = _fitted(fitting, model)
+    cars = [
+        replace(log, engaged=out.engaged & out.moving) for log, out in zip(logs or rollouts.logs, first, strict=True)
+    ]
+    data = DriveData.of(cars)
+    if data.channel_count == 1:
+        data = data.below(ONE_CHANNEL_HZ)
+    ranges = _Ranges(before, limits)
+    plain = LinearFit.of(LinearResponse(data, _readings(data, first), *_none(data)))
+    fit = LinearFit.of(_around(data, rollouts, ranges, before))
     for _ in range(_ROUNDS - 1):
         left = rollouts.most - len(rollouts)
-        if np.abs(fit.z[: len(limits)]).max() < _STAYS or left < fewest_rollouts(limits):
+        if np.abs(fit.z - fit.model.at).max() < _STAYS or left < fewest_rollouts(limits):
             break
-        model = _Linear.around(record, cars, rollouts, model.parameters(fit.z), limits)
-        fit = _fitted(fitting, model)
-    values = model.parameters(fit.z)
+        fit = LinearFit.of(_around(data, rollouts, ranges, ranges.values(fit.z)))
+    values = ranges.values(fit.z)
     outputs = rollouts.at(values)
-    held = fitting.hold_out(fit)
-    needed = fitting.evidence(_as_it_is(record, cars, fitting, first), held).strength(len(limits)) > 0
-    errors = dict(zip(limits, (fitting.errors(fit)[: len(limits)] * _scales(limits)).tolist(), strict=True))
+    needed = fit.evidence_over(plain) > EFFECT_NATS
+    errors = dict(zip(limits, (fit.errors * ranges.scales).tolist(), strict=True))
     found = tuple(
-        _difference(name, before[name], values[name], errors[name], fitting.whitening.blocks - 1, needed)
-        for name in limits
+        _difference(name, before[name], values[name], errors[name], data.frame_count - 1, needed) for name in limits
     )
     return Adjusted(outputs, found, len(rollouts))
-
-
-def _as_it_is(record: AnalysisRecord, cars: Sequence[Log], fitting: RobustFit, first: Sequence[Log]) -> HeldOut:
-    """The simulator as it is, of which nothing but the lateness of speed is fitted."""
-    plain = _Linear(record, _measured(record, cars, first), np.zeros((0, *record.measured.shape)), {}, {})
-    if plain.size:
-        return fitting.hold_out(_fitted(fitting, plain))
-    white = fitting.white(plain, np.zeros(0))
-    return HeldOut(fitting.nats(white), np.zeros((0, 0)), white)
 
 
 def _difference(name: str, before: float, value: float, sd: float, freedom: int, needed: bool) -> ParameterDifference:
@@ -143,94 +133,54 @@ def _difference(name: str, before: float, value: float, sd: float, freedom: int,
     return ParameterDifference(name, before, car, needed and abs(value - before) > surely, own=True)
 
 
-def _fitting(record: AnalysisRecord, model: _Linear) -> RobustFit:
-    """With the noise that is left once commands, speed and time have predicted what they can."""
-    rough = RobustFit(NoiseWhitening.band(record, record.measured - model.center))
-    return RobustFit(NoiseWhitening.autoregressive(record, left_over(rough, _fitted(rough, model))))
+@dataclass(frozen=True)
+class _Ranges:
+    """Parameters as z (parameter,): prior standard deviations, half of each range, from where they are `before`."""
 
-
-def _fitted(fitting: RobustFit, model: _Linear) -> Fit[_Linear]:
-    return fitting.fit(model, np.zeros((1, model.size)), iterations=10)
-
-
-def _measured(record: AnalysisRecord, cars: Sequence[Log], outputs: Sequence[Log]) -> FloatArray:
-    """The outputs as the channels of the car's record, (channel, row) [m/s²]."""
-    channels = {"accel": "accel" in record.channels, "speed": "speed" in record.channels}
-    logs = [
-        replace(log, **{name: getattr(out, name) if there else None for name, there in channels.items()})
-        for log, out in zip(cars, outputs, strict=True)
-    ]
-    measured = AnalysisRecord.for_budget(logs).measured
-    if measured.shape != record.measured.shape:  # it stands where the car does not, and too little is left
-        raise InputError("logs: too little of them is driven by both car and simulator for its parameters to be fitted")
-    return measured
-
-
-@dataclass(frozen=True, eq=False)
-class _Linear:
-    """What `RobustFit` fits: `center` and `slopes` (parameter, channel, row) for one prior SD of each.
-
-    The coordinates are those of the parameters named in `limits`, half of their range each, from `values` on, and, with
-    two channels, how late speed is read against acceleration.
-    """
-
-    record: AnalysisRecord
-    center: FloatArray
-    slopes: FloatArray
-    values: Values
+    before: Values
     limits: Limits
-    index: dict[str, slice] = field(init=False)
-    low: FloatArray = field(init=False)
-    high: FloatArray = field(init=False)
-
-    def __post_init__(self) -> None:
-        ends = np.array([[x - self.values[n] for x in self.limits[n]] for n in self.limits]).reshape(-1, 2)
-        low, high = (ends / _scales(self.limits)[:, None]).T
-        index, slopes = {name: slice(n, n + 1) for n, name in enumerate(self.limits)}, self.slopes
-        if len(self.record.channels) == 2:
-            late = np.zeros_like(self.center)
-            at = self.record.channels.index("speed")
-            for stretch in self.record.stretches:
-                late[at, stretch.rows] = -LATENESS_S * np.gradient(self.center[at, stretch.rows]) / self.record.dt
-            index[LATENESS] = slice(len(low), len(low) + 1)
-            slopes, low, high = np.concatenate([slopes, late[None]]), np.append(low, -6.0), np.append(high, 6.0)
-        for name, value in (("slopes", slopes), ("index", index), ("low", low), ("high", high)):
-            object.__setattr__(self, name, value)
-
-    @classmethod
-    def around(
-        cls, record: AnalysisRecord, cars: Sequence[Log], rollouts: Rollouts, values: Values, limits: Limits
-    ) -> _Linear:
-        steps = {name: _BESIDE * (high - low) for name, (low, high) in limits.items()}
-        steps = {name: x if values[name] + x <= limits[name][1] else -x for name, x in steps.items()}
-        beside = [{**values, name: values[name] + step} for name, step in steps.items()]
-        center, *others = (_measured(record, cars, outputs) for outputs in rollouts.each([values, *beside]))
-        scales = zip(others, _scales(limits), steps.values(), strict=True)
-        slopes = [(other - center) * scale / step for other, scale, step in scales]
-        return cls(record, center, np.array(slopes), values, limits)
 
     @property
-    def size(self) -> int:
-        return len(self.low)
+    def scales(self) -> FloatArray:
+        return np.array([0.5 * (high - low) for low, high in self.limits.values()])
 
-    def simulate(self, z: FloatArray) -> FloatArray:
-        """(..., channel, row) at `z` (..., size)."""
-        return self.center + np.tensordot(np.clip(z, self.low, self.high), self.slopes, 1)
+    @property
+    def ends(self) -> FloatArray:
+        """Least and greatest z, (parameter, 2)."""
+        return np.array([self.z({n: ends[k] for n, ends in self.limits.items()}) for k in (0, 1)]).T
 
-    def traded(self, z: FloatArray) -> FloatArray:
-        return np.zeros((0, len(z)))
+    def z(self, values: Values) -> FloatArray:
+        return np.array([values[name] - self.before[name] for name in self.limits]) / self.scales
 
-    def named(self, z: FloatArray) -> dict[str, FloatArray]:
-        """By name, at coordinates `z` (size,), each (1,)."""
-        return {name: np.array([value]) for name, value in self.parameters(z).items()}
-
-    def parameters(self, z: FloatArray) -> dict[str, float]:
-        """By name, at coordinates `z` (size,)."""
-        inside = np.clip(z, self.low, self.high)
-        scales = zip(self.limits, _scales(self.limits), strict=True)
-        return {name: float(self.values[name] + inside[n] * scale) for n, (name, scale) in enumerate(scales)}
+    def values(self, z: FloatArray) -> dict[str, float]:
+        low, high = np.array(list(self.limits.values())).T
+        inside = np.clip(np.array([self.before[name] for name in self.limits]) + self.scales * z, low, high)
+        return dict(zip(self.limits, inside.tolist(), strict=True))
 
 
-def _scales(limits: Limits) -> FloatArray:
-    """Prior standard deviations: half of each range."""
-    return np.array([0.5 * (high - low) for low, high in limits.values()])
+def _around(data: DriveData, rollouts: Rollouts, ranges: _Ranges, values: Values) -> LinearResponse:
+    """The simulator linearised at `values`, by a rollout beside each."""
+    steps = {name: _BESIDE * (high - low) for name, (low, high) in ranges.limits.items()}
+    steps = {name: x if values[name] + x <= ranges.limits[name][1] else -x for name, x in steps.items()}
+    beside = [{**values, name: values[name] + step} for name, step in steps.items()]
+    center, *others = (_readings(data, outputs) for outputs in rollouts.each([values, *beside]))
+    scaled = np.array(list(steps.values())) / ranges.scales
+    slopes = np.array([(other - center) / step for other, step in zip(others, scaled, strict=True)])
+    return LinearResponse(data, center, slopes, ranges.z(values), ranges.ends)
+
+
+def _none(data: DriveData) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Slopes, place and limits of no parameters."""
+    return np.zeros((0, data.channel_count, len(data.time))), np.zeros(0), np.zeros((0, 2))
+
+
+def _readings(data: DriveData, outputs: Sequence[Log]) -> FloatArray:
+    """The outputs as readings (channel, row) of the car's channels."""
+    return np.array([rows_of(data, [_channel(out, name) for out in outputs]) for name in data.channels])
+
+
+def _channel(output: Log, name: str) -> FloatArray:
+    found = getattr(output, name)
+    if found is None:
+        raise InputError(f"{output.name}: has no {name}, needs the channels of the car's log")
+    return found

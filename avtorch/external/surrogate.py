@@ -9,28 +9,31 @@ stays the simulator's own (`discrepancy`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.effect_model import EffectModel
-from avtorch.gap.budget.noise_whitening import NoiseWhitening
-from avtorch.gap.budget.repaired_model import plant_of
-from avtorch.gap.budget.robust_fit import Fit, RobustFit
-from avtorch.gap.budget.score_test import ScoreTest
-from avtorch.gap.simulator.effect import EFFECTS, Effect
+from avtorch.external.noise_free import NoiseFree
+from avtorch.gap.engine.car import plant_of
+from avtorch.gap.engine.coordinates import EFFECTS as ATOMS
+from avtorch.gap.engine.coordinates import EngineEffect, adopt
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.gauss_newton import objective
+from avtorch.gap.engine.priors import CLAIM_HZ
+from avtorch.gap.engine.search import other_limit, promises
+from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log
 
 MOST_EFFECTS = 8
 ENOUGH = 0.002
 """Share of the response (root mean square) that may be left over."""
-_WORTH = 0.95  # of the errors on blocks held out, that an effect must leave at most
+_WORTH = 0.95  # of the errors on frames held out, that an effect must leave at most
 _PER_PARAMETER = 1.5  # times smaller errors, that a parameter more has to be worth when two effects compete
-_FITTED, _HELD_OUT = 8, 3  # effects fitted, those of which a score test promises most, and held out of these
-_LAGS = (-2.0, -1.0, 0.0, 1.0)  # prior standard deviations
+_FITTED, _HELD_OUT = 16, 4  # effects fitted, those that promise most, and held out of these
+_LAGS_S = (0.07, 0.15, 0.3, 0.6)  # from which the first fits begin
+_SHORTER = 0.5  # of a lag that gives its time to a delay or a second pole
 _FIRST_ERROR = 0.1  # of the response
 _LEAST_ERROR = 1e-5  # of the response, so that a perfect fit has a scale
 
@@ -38,7 +41,7 @@ _LEAST_ERROR = 1e-5  # of the response, so that a perfect fit has a scale
 @dataclass(frozen=True)
 class Surrogate:
     """`plant`: the chain that answers as the simulator does; `left`: share of the response that it does not, by channel
-    (root mean squares, of acceleration and of the derivative of speed, below 20 Hz)."""
+    (root mean squares, of acceleration and of the derivative of speed, below 10 Hz)."""
 
     plant: GapPlant
     left: Mapping[str, float]
@@ -55,7 +58,7 @@ def surrogate_of(
     `enough`: share of the response that may be left over.
     `progress(what, done, of)` is called at each effect.
 
-    Raises `InputError` where the drives are too short, see `AnalysisRecord.for_budget`.
+    Raises `InputError` where the drives are too short, see `DriveData.of`.
 
     Example:
         >>> from avtorch import Leader, simulate
@@ -67,77 +70,83 @@ def surrogate_of(
         >>> {name: round(float(x), 2) for name, x in found.plant.values().items()}
         {'T_L': 0.5, 'K_L': 1.0, 'dead_time.delay_s': 0.3}
     """
-    record = AnalysisRecord.for_budget(simulated)
-    size = record.measured[:, record.counts].std(-1) + 1e-9
-    bare = EffectModel(record, plant([], sigma=0.0))
-    starts = np.array([bare.coordinates({"T_L": np.array(lag)}) for lag in _LAGS])
-    now = _fitting(record, _FIRST_ERROR * size).fit(bare, starts, iterations=15)
+    data = DriveData.of(simulated)
+    size = np.std(data.channel_rows(data.accel, data.speed), axis=1) + 1e-9
+    data = data.below(CLAIM_HZ)
+    bare = [NoiseFree(data, sd=_FIRST_ERROR * size) for _ in _LAGS_S]
+    for h, lag in zip(bare, _LAGS_S, strict=True):
+        h["T_L"] = lag
+    now = max((h.fitted(15) for h in bare), key=objective)
+    kinds = _kinds(data)
     for number in range(MOST_EFFECTS):
         if progress is not None:
             progress("simulator", number, MOST_EFFECTS)
-        if (_errors(now) < enough * size).all():
+        if (now.errors < enough * size).all():
             break
-        fitting = _fitting(record, np.maximum(_errors(now), _LEAST_ERROR * size))
-        now = fitting.fit(now.model, now.z[None])
-        entered = _entered(fitting, now, _kinds(record))
+        now = now.with_sd(np.maximum(now.errors, _LEAST_ERROR * size)).fitted()
+        entered = _entered(now, [e for e in kinds if e.base not in now.names])
         if entered is None:
             break
         now = entered
-    now = _without_the_idle(record, now, size, enough)
-    left = dict(zip(record.channels, (_errors(now) / size).tolist(), strict=True))
-    return Surrogate(plant_of(now, bare.base), left)
+    now = _without_the_idle(now, size, enough)
+    now = now.with_sd(np.maximum(now.errors, _LEAST_ERROR * size)).fitted()
+    left = dict(zip(data.channels, (now.errors / size).tolist(), strict=True))
+    return Surrogate(plant_of(now, plant([], sigma=0.0)), left)
 
 
-def _kinds(record: AnalysisRecord) -> list[type[Effect]]:
+def _kinds(data: DriveData) -> list[EngineEffect]:
     """Effects that a simulator can have: the same on every drive, by no chance, and seen in these channels."""
+    kinds = [k for k in EFFECTS.values() if not (k.random or k.of_the_drive or k.own_onset)]
+    for kind in kinds:
+        adopt(kind)
+    names = {kind.name for kind in kinds}
     return [
-        kind
-        for kind in EFFECTS.values()
-        if not (kind.random or kind.of_the_drive or kind.own_onset)
-        and (record.has_speed or not kind.needs_speed)
-        and (kind.place != "sensor" or len(record.channels) == 2)
+        replace(e, onset="never")
+        for e in ATOMS.values()
+        if e.base in names and e.onset != "must" and e.coordinates and e.needs <= set(data.channels)
     ]
 
 
-def _fitting(record: AnalysisRecord, sd: FloatArray) -> RobustFit:
-    """Least squares in which each channel's errors have this size (channel,) and no colour."""
-    return RobustFit(NoiseWhitening.of(record, np.ones((len(record.channels), 1)), sd))
-
-
-def _errors(fit: Fit) -> FloatArray:
-    """(channel,) [m/s²], root mean square."""
-    return np.sqrt((fit.residuals[:, fit.model.record.counts] ** 2).mean(-1))
-
-
-def _held_out(fitting: RobustFit, fit: Fit) -> float:
-    return float(np.sqrt((fitting.hold_out(fit).white ** 2).mean()))
-
-
-def _entered(fitting: RobustFit, now: Fit, kinds: Sequence[type[Effect]]) -> Fit | None:
-    """The model with the effect that leaves least on blocks held out; an effect with more parameters has to leave
+def _entered(now: NoiseFree, kinds: Sequence[EngineEffect]) -> NoiseFree | None:
+    """The model with the effect that leaves least on frames held out; an effect with more parameters has to leave
     less for each. None where no effect is worth it."""
-    before = _held_out(fitting, now)
-    test = ScoreTest.at(fitting, now)
-    candidates = [test.candidate(kind) for kind in kinds if kind.name not in now.model.names]
-    candidates.sort(key=lambda candidate: -candidate.promise)
-    rough = [fitting.fit(c.model, c.starts, iterations=4) for c in candidates[:_FITTED]]
-    fits = [fitting.fit(f.model, f.z[None], iterations=12) for f in sorted(rough, key=lambda f: f.nats)[:_HELD_OUT]]
-    left = [_held_out(fitting, fit) / before for fit in fits]
-    worth = [(share * _PER_PARAMETER**fit.model.size, n) for n, (share, fit) in enumerate(zip(left, fits, strict=True))]
+    before, starts = now.held_out, dict[str, list[tuple[float, ...]]]()
+    for promise in promises(now, kinds):
+        if promise.effect in starts or len(starts) < _FITTED:
+            starts.setdefault(promise.effect, []).append(promise.start)
+    rough = [max((h.fitted(4) for h in _begun(now, e, starts[e])), key=objective) for e in starts]
+    best = sorted(rough, key=lambda h: -objective(h))[:_HELD_OUT]
+    fits = [_with_limits(h.fitted(12)) for h in best]
+    left = [h.held_out / before for h in fits]
+    worth = [(share * _PER_PARAMETER ** len(h.free), n) for n, (share, h) in enumerate(zip(left, fits, strict=True))]
     worth = [(value, n) for value, n in worth if left[n] < _WORTH]
     return fits[min(worth)[1]] if worth else None
 
 
-def _without_the_idle(record: AnalysisRecord, now: Fit, size: FloatArray, enough: float) -> Fit:
+def _begun(now: NoiseFree, effect: str, starts: Sequence[tuple[float, ...]]) -> list[NoiseFree]:
+    """The model with one more effect at each of `starts`; a lag and a delay trade places, so from a shorter lag too."""
+    out = [now.with_effect(effect, start) for start in starts]
+    for h in list(out):
+        if EFFECTS[ATOMS[effect].base].memory or effect in ("second_order_actuator", "rate_limit"):
+            shorter = h.copy()
+            shorter["T_L"] *= _SHORTER
+            out.append(shorter)
+    return out
+
+
+def _with_limits(h: NoiseFree) -> NoiseFree:
+    """The model with limits of the command that a fit put out of reach brought back, where that explains more."""
+    found = other_limit(h)
+    assert isinstance(found, NoiseFree)
+    return found
+
+
+def _without_the_idle(now: NoiseFree, size: FloatArray, enough: float) -> NoiseFree:
     """The model without effects that the others make superfluous, the most superfluous first."""
-    while now.model.names:
-        errors = np.maximum(_errors(now), _LEAST_ERROR * size)
-        fitting = _fitting(record, errors)
-        without = []
-        for name in now.model.names:
-            model = now.model.without(name)
-            without.append(fitting.fit(model, model.coordinates(now.known)[None], iterations=8))
-        cost = [float((_errors(fit) / np.maximum(errors, enough * size)).max()) for fit in without]
+    while now.effects:
+        errors = np.maximum(now.errors, _LEAST_ERROR * size)
+        without = [now.without(e).with_sd(errors).fitted() for e in now.effects]
+        cost = [float((h.errors / np.maximum(errors, enough * size)).max()) for h in without]
         if min(cost) > 1 / _WORTH:
             break
         now = without[int(np.argmin(cost))]
