@@ -233,7 +233,8 @@ def simulate(  # pragma: no cover - compiled
         if q[_LAG_RATIO] != 0.0:
             lag *= math.exp(q[_LAG_RATIO])
         if p[_STEP] != 0.0 and t + h > acts[_STEP]:
-            gain *= 1.0 + p[_STEP] * (_stepped(t + h - acts[_STEP]) - _stepped(t - acts[_STEP])) / h
+            begun = max(acts[_STEP], t - 1.0)  # long ago is whole, and keeps its digits
+            gain *= 1.0 + p[_STEP] * (_stepped(t + h - begun) - _stepped(t - begun)) / h
         if p[_DRIFT] != 0.0:
             gain *= 1.0 + p[_DRIFT] * (t + 0.5 * h - first_s) / length_s
         if lost > 0.0 and u2 > 0.0:

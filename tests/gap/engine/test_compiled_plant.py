@@ -10,7 +10,7 @@ import torch
 
 from avtorch import Log
 from avtorch.gap.engine.car import plant_of
-from avtorch.gap.engine.coordinates import EFFECTS
+from avtorch.gap.engine.coordinates import EFFECTS, FROM_THE_START, INDEX
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.simulator.simulator_input import SimulatorInput
@@ -83,3 +83,14 @@ def test_two_effects_act_as_in_the_simulator():
         h = _hypothesis(effects)
         for compiled, torch_ in zip(h.on_grid(), _by_the_simulator(h), strict=True):
             np.testing.assert_allclose(compiled, torch_, rtol=0, atol=1e-9, err_msg="+".join(effects))
+
+
+def test_a_gain_that_has_always_been_changed_is_another_gain():
+    h = _hypothesis(("gain_change",))
+    values, onsets = h.values.copy(), np.full(len(h.values), FROM_THE_START)
+    values[INDEX["gain_step"]] = -0.3
+    other = h.values.copy()
+    other[INDEX["gain_step"]] = 0.0
+    other[INDEX["K_L"]] *= 0.7
+    for changed, plain in zip(h.on_grid(values, onsets), h.on_grid(other, onsets), strict=True):
+        assert np.abs(changed - plain).max() < 1e-9
