@@ -78,8 +78,7 @@ plots.show(over_diagnosis.where_figure(found), OUT / "where.png")
 # %% [markdown]
 # Above: the stretch where the simulators with the effect (blue) and without it (orange) differ most, and the
 # measurement. Below: how the effect (blue) and the drive (grey) are distributed over time, speed and command. The
-# printed diagnosis has it in words: the gap lies in the car's motion, not in its sensor's reading, and at low
-# frequencies. A part of the time, the speeds or the commands is named (and shaded) only where it holds nearly all of
+# printed diagnosis has it in words where one part holds most of it. A part of the time, the speeds or the commands is named (and shaded) only where it holds nearly all of
 # the effect in far fewer rows.
 
 # %%
@@ -93,10 +92,8 @@ if scores is not None:
     plots.show(over_diagnosis.shrinkage_figure(found), OUT / "shrinkage.png")
 
 # %% [markdown]
-# Rollouts on held-out parts of the drive. Orange is the baseline simulator, blue the repaired one. The light line is
-# the noise floor. The grey crosses are the baseline with a black box, which with a minute of training data increases
-# the error. Note the interval of `closed`: a minute in which an effect hardly acts cannot show how far it closes the
-# gap.
+# Free runs on held-out parts of the drive. Orange is the baseline simulator, blue the repaired one, light blue the noise
+# floor. Grey is the baseline with a black box, which learns what it can from the rest of the drive.
 #
 # ## The next experiment
 #
@@ -138,8 +135,8 @@ else:
     print("not distinguished:", ", ".join(both.verdict.alias_set))
 
 # %% [markdown]
-# The ramps go through zero slowly, both ways, at low speed and on a road that is assumed level: there a dead band shows
-# and the others do not. Both drives are diagnosed together.
+# Both drives are diagnosed together. The verdict stays, and lag and gain become far more certain. The probability of the
+# cause hardly rises, against the expectation, which takes the equations of the table for exact.
 #
 # ## The truth
 
