@@ -24,7 +24,7 @@ import torch
 
 import avtorch
 from avtorch.follower import diagnose_follower
-from avtorch.gap import DeadTime, GainChange, plant
+from avtorch.gap import DeadTime, plant
 from avtorch.gap.answer.verdict import Candidate
 from avtorch.gap.drive_record import Record
 from avtorch.inference import BeliefStream, SamplerSettings
@@ -43,13 +43,13 @@ RATE_HZ = 25
 
 
 def _drive(seconds: float = 50.0, rate_hz: int = RATE_HZ, seed: int = 1) -> Log:
-    car = plant([DeadTime(0.06)], T_L=0.4, K_L=0.9)
+    car = plant([DeadTime(0.25)], T_L=0.4, K_L=0.9)
     return log_of(car, seconds=seconds, rate_hz=rate_hz, rng=np.random.default_rng(seed))
 
 
 @pytest.fixture(scope="module")
 def drive() -> Log:
-    """50 s at 25 Hz with a short dead time and little noise."""
+    """50 s at 25 Hz with a dead time and little noise."""
     log = _drive()
     assert log.accel is not None
     jerk = np.gradient(log.accel, log.time) + 0.05 * np.random.default_rng(2).standard_normal(log.rows)
@@ -210,15 +210,18 @@ def test_two_drives_need_not_share_a_clock() -> None:
 
 @pytest.mark.slow
 def test_an_onset_is_on_the_clock_of_its_log() -> None:
-    """A third of the gain is lost from 40 s on."""
-    car = plant([GainChange(0.67, 40.0, 0.5)], T_L=0.4, K_L=0.9)
-    log = log_of(car, seconds=80.0, rate_hz=20, rng=np.random.default_rng(6))
+    """The accelerometer has an offset from 40 s on."""
+    log = log_of(plant([], T_L=0.4, K_L=0.9), seconds=80.0, rate_hz=20, rng=np.random.default_rng(6))
+    assert log.accel is not None
+    log = _with(log, accel=log.accel + np.where(log.time > 40.0, 0.5, 0.0))
     near, far = (
-        avtorch.diagnose(_with(log, time=log.time + offset), effects=["gain_change", "dead_time"], pairs=False)
+        avtorch.diagnose(_with(log, time=log.time + offset), effects=["sensor_bias", "dead_time"], pairs=False)
         for offset in (0.0, OFFSETS[1])
     )
-    assert near.verdict.names == far.verdict.names == ("gain_change",)
-    assert near.onset_s == near.onset_from_start_s == far.onset_from_start_s == pytest.approx(40.0, abs=2.0)
+    assert near.verdict.names == far.verdict.names == ("sensor_bias",)
+    assert near.onset_s == near.onset_from_start_s == pytest.approx(40.0, abs=1.0)
+    # to what a stamp of that size resolves
+    assert far.onset_from_start_s == pytest.approx(near.onset_from_start_s, abs=1e-6)
     assert far.onset_from_start_s is not None
     assert far.onset_s == pytest.approx(far.onset_from_start_s + OFFSETS[1], abs=1e-6)
 
@@ -476,7 +479,7 @@ def test_the_sign_of_everything_changes_no_fit_of_the_acceleration(drive: Log) -
 @pytest.mark.slow
 def test_a_drive_given_twice_halves_the_variance(drive: Log) -> None:
     """Estimates stay within what the prior moves them by, and twice the rows halve that; spreads shrink by sqrt 2 to
-    the tenth that the noise, estimated anew, and the prior's own share allow."""
+    the quarter that the recorder's lateness, of which its prior says most, and the noise, estimated anew, allow."""
     one, two = _fits(drive, *EFFECTS), _fits([drive, drive], *EFFECTS)
     for fits in (one, two):
         assert max(EFFECTS, key=lambda name: fits[name].log_evidence if name in fits else -np.inf) == "dead_time"
@@ -484,9 +487,9 @@ def test_a_drive_given_twice_halves_the_variance(drive: Log) -> None:
     for a, b in ((single.parameters, double.parameters), (single.moved, double.moved)):
         for key, q in a.items():
             assert b[key].mean == pytest.approx(q.mean, abs=0.2 * q.sd)
-            assert b[key].sd == pytest.approx(q.sd / math.sqrt(2), rel=0.1)
+            assert b[key].sd == pytest.approx(q.sd / math.sqrt(2), rel=0.25)
     # less what a parameter's price grows by, half of ln 2, and what the noise's estimate does
-    assert double.log_evidence == pytest.approx(2 * single.log_evidence, rel=0.1)  # type: ignore[operator]
+    assert double.log_evidence == pytest.approx(2 * single.log_evidence, rel=0.15)  # type: ignore[operator]
 
 
 @pytest.mark.slow
@@ -496,9 +499,9 @@ def test_a_diagnosis_of_a_drive_given_twice_is_the_same(drive: Log) -> None:
     for name, q in one.winner.parameters.items():
         again = two.winner.parameters[name]
         assert again.mean == pytest.approx(q.mean, abs=0.2 * q.sd)
-        assert again.sd == pytest.approx(q.sd / math.sqrt(2), rel=0.1)
+        assert again.sd == pytest.approx(q.sd / math.sqrt(2), rel=0.25)
     assert one.winner.log_evidence is not None
-    assert two.winner.log_evidence == pytest.approx(2 * one.winner.log_evidence, rel=0.1)
+    assert two.winner.log_evidence == pytest.approx(2 * one.winner.log_evidence, rel=0.15)
 
 
 def test_a_drive_beside_itself_has_not_changed() -> None:

@@ -9,7 +9,8 @@ from avtorch.errors import InputError
 from avtorch.gap import Budget, ConstantResistance, DeadBand, DeadTime, Effect, SensorBias, gap_budget
 from tests.gap.cars import log_of
 
-FEW = ["dead_time", "dead_band", "constant_resistance", "sensor_bias", "sensor_scale"]
+FEW = ["dead_time", "dead_band", "constant_resistance", "sensor_bias", "sensor_scale", "gust"]
+"""With the gust: the noise of `log_of` has a slow force, which is an unknown cause where no gust may be."""
 
 
 def sums_to_one(budget: Budget) -> None:
@@ -35,8 +36,8 @@ def sums_to_one(budget: Budget) -> None:
 )
 def test_a_single_cause_is_the_whole_budget(effect: Effect, key: str, within: float, fresh_seed: int) -> None:
     budget = gap_budget(log_of([effect], seed=fresh_seed), effects=FEW)
-    assert budget.names == (effect.name,)
-    part = budget.parts[0]
+    (part,) = budget.parts
+    assert part.name == effect.name
     assert part.parameters[key].mean == pytest.approx(getattr(effect, key), abs=within)
     assert part.share.mean > 0.85
     assert part.onset_s is None
@@ -45,12 +46,12 @@ def test_a_single_cause_is_the_whole_budget(effect: Effect, key: str, within: fl
 
 @pytest.mark.slow
 def test_parts_and_what_is_unexplained_sum_to_one(fresh_seed: int) -> None:
-    log = log_of([ConstantResistance(0.2), SensorBias(0.2), DeadBand(0.25)], seed=fresh_seed)
+    log = log_of([DeadTime(0.3), SensorBias(0.2)], seed=fresh_seed)
     budget = gap_budget(log, effects=FEW)
-    assert set(budget.names) == {"constant_resistance", "sensor_bias", "dead_band"}
+    assert {part.name for part in budget.parts} == {"dead_time", "sensor_bias"}
     sums_to_one(budget)
     assert budget.before > budget.left >= 1.0
-    assert "constant_resistance" in str(budget)
+    assert "dead_time" in str(budget)
 
 
 def test_without_a_cause_all_is_unexplained() -> None:
@@ -64,7 +65,8 @@ def test_without_a_cause_all_is_unexplained() -> None:
 @pytest.mark.parametrize("number", range(4))
 def test_coloured_noise_is_no_cause(number: int, fresh_seed: int) -> None:
     budget = gap_budget(log_of(seed=fresh_seed + number), effects=FEW)
-    assert budget.names == ()
+    assert budget.parts == ()
+    assert "unknown" not in budget.verdict
 
 
 @pytest.mark.slow

@@ -76,7 +76,10 @@ def test_a_gust_that_is_named_alone_has_a_repaired_simulator() -> None:
     assert found.plant is not None
     assert [e.name for e in found.plant.effects] == ["gust"]
     # no rollout predicts it, so nothing closes
-    assert found.shrinkage is None
+    assert found.shrinkage is not None
+    for channel in ("accel", "speed"):
+        metric = found.shrinkage.by_metric[f"rollout_rmse_{channel}"]
+        assert metric.after == pytest.approx(metric.before, rel=0.05)
 
 
 @pytest.mark.slow
