@@ -44,12 +44,10 @@ def answers(laps: dict[int, Log], request: pytest.FixtureRequest) -> dict[int, D
 
 
 @pytest.mark.slow
-def test_every_lap_gets_an_answer_that_the_others_share(answers: dict[int, Diagnosis]) -> None:
+def test_no_lap_blames_an_effect_for_sure(answers: dict[int, Diagnosis]) -> None:
     for answer in answers.values():
         # speed alone, one minute: nothing is blamed for sure
         assert max(c.probability for c in answer.candidates if c.effects) < 0.9
-    shared = set.intersection(*(set(a.verdict.alias_set) for a in answers.values()))
-    assert shared, {k: a.verdict.alias_set for k, a in answers.items()}
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +73,7 @@ def test_lag_and_delay_from_the_laps(bases: dict[int, Hypothesis], lap: int) -> 
 def test_one_pole_will_do(laps: dict[int, Log]) -> None:
     """3 nats are twenty to one: a result of one lap out of three does not belong to the car."""
     tried = ("dead_time", "second_order_actuator")
-    found = [avtorch.diagnose(log, effects=[*tried, "road_grade"], pairs=False) for log in laps.values()]
+    found = [avtorch.diagnose(log, effects=[*tried, "road_grade", "gust"], pairs=False) for log in laps.values()]
     for name in tried:
         gains = [c.log_evidence or 0.0 for answer in found for c in answer.candidates if c.name == name]
         assert sum(gain > 3 for gain in gains) <= 1, (name, gains)
