@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -180,6 +180,9 @@ def average(
     weights = [w for x in examined for w in _weights(x, examined, alone)]
     if effects is not None or most is not None:
         allowed = None if effects is None else {*effects, "none", "unknown"}
+        # what chance decides and nobody asked for is noise
+        nameless = set() if effects is None else {*SLOW, "outliers"} - {*effects}
+        weights = [replace(w, label=_without(w.label, nameless)) for w in weights]
         weights = [
             w
             for w in weights
@@ -205,6 +208,10 @@ def average(
 
 
 # inside ---------------------------------------------------------------------------------------------------------------
+def _without(label: str, names: Collection[str]) -> str:
+    return "+".join(n for n in label.split("+") if n not in names) or "none"
+
+
 def _given(label: str, prior: Mapping[str, float]) -> float:
     """Logarithm of the user's weight of a label: the product of its causes', times that of `"pair"` for several."""
     names = label.split("+")

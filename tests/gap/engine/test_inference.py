@@ -24,6 +24,7 @@ from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.effect import Effect
 from avtorch.io import Log
 from tests.bars import BAR
+from tests.gap.cars import log_of
 from tests.gap.engine.recorded import recorded_log
 
 DELAY, BIAS, RECORDER_S = 0.25, 0.3, 0.02
@@ -194,3 +195,11 @@ def test_a_speed_in_whole_kmh_is_read(rotating_seed: int) -> None:
 def test_slow_and_fast_recorders_are_read(rate_hz: int, rotating_seed: int) -> None:
     log = recorded_log([DeadTime(DELAY)], seconds=60.0, rate_hz=rate_hz, seed=rotating_seed)
     says(found_in(log, TWO), "dead_time", {"delay_s": DELAY})
+
+
+def test_a_slow_force_that_nobody_asked_for_is_noise() -> None:
+    """Not a cause without a name: the log's quiet road pushes a little, as every road does."""
+    log = log_of([DeadTime(0.3)], seed=12)
+    found = infer(DriveData.of(log), effects=["dead_time", "sensor_bias"]).average
+    assert found.label == "dead_time"
+    assert not {"gust", "road_grade", "outliers"} & {n for label in found.probabilities for n in label.split("+")}
