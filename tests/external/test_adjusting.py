@@ -91,7 +91,10 @@ def test_few_rollouts_are_enough_and_no_more_are_made() -> None:
     assert count <= 13  # four times three, and the last
     few, least = fitted(log, most=5)
     assert least <= 5
-    for name, reach in (("lag", 0.2), ("mass", 300.0)):  # once linear is nearer than before, by a third at least
+    for name, reach in (
+        ("lag", 0.3),
+        ("mass", 300.0),
+    ):  # once linear is nearer than before, of the lag by half at least
         assert abs(few[name][0] - found[name][0]) < reach
     with pytest.raises(InputError, match="most_rollouts: found 3, needs 5 or more to adjust lag, mass"):
         ExternalSimulator(Truck, adjustable=LIMITS, most_rollouts=3)
