@@ -88,9 +88,8 @@ for what, answer in (("this minute", quiet), ("a livelier one", without)):
     print(f"without the class, {what}:", answer.verdict.name, f"{answer.winner.probability:.2f}")
 
 # %% [markdown]
-# With the class among the hypotheses the diagnosis names the effect and its size. Without it it cannot. In this
-# minute no effect of the table is likelier there than not, as a smaller gain explains most of it: the verdict is
-# `none`. In a livelier minute of the same car an effect of the table stands in for it.
+# With the class among the hypotheses the diagnosis names the effect and its size. Without it it cannot, and says so:
+# the verdict is `unknown`, a cause that is not in the table, in this minute and in a livelier one of the same car.
 #
 # `@register` above the class would make it available everywhere: in strings, in TOML files, in every diagnosis.
 #
