@@ -8,7 +8,7 @@ density; then they are stretched to cover what parts of the drive disagree on (`
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -101,12 +101,15 @@ def sample(
     if not why:
         density = HypothesisDensity(h, temper, normal.names, np.sqrt(np.diag(normal.covariance)))
         generator = torch.Generator().manual_seed(seed)
-        found, why = _sampled(density, normal, chains, draws, generator)
+        try:
+            found, why = _sampled(density, normal, chains, draws, generator)
+        except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
+            why = "the surrogate's draws have no covariance"
     if found is None:
         x = normal.draws(chains * draws, rng, widen=widen).reshape(chains, draws, -1)
         found = Draws(normal.names, x, "laplace", float(chains * draws), 0.0, why=why)
     elif widen:
-        found = Draws(**{**vars(found), "x": normal.stretched(found.x)})
+        found = replace(found, x=normal.stretched(found.x))
     return _complete(found, h, normal.widest if widen else 1.0)
 
 
@@ -115,7 +118,7 @@ def _complete(found: Draws, h: Hypothesis, widened: float) -> Draws:
     x = np.empty((*found.x.shape[:-1], len(h.free)))
     for k, name in enumerate(h.free):
         x[..., k] = found[name] if name in found.names else h[name]
-    return Draws(**{**vars(found), "names": tuple(h.free), "x": x, "widened": widened})
+    return replace(found, names=tuple(h.free), x=x, widened=widened)
 
 
 def _sampled(
@@ -228,6 +231,9 @@ def _walked(
     if not bool(walked.converged[0]):
         return None, walked.why[0]
     z = density.unconstrain(walked.draws[:, :, 0])
+    worth = float(effective_sample_size(z).min())
+    if not worth >= _FEWEST:
+        return None, f"its chains are worth {worth:.0f} draws"
     off = stein_discrepancy(density, mode, z, generator)
     if off > 0:
         return None, f"by Stein's identity a variance of its draws is off by {off:.2g}"

