@@ -243,7 +243,10 @@ def _linear_evidence(
     for _ in range(iterations):
         weighted = np.tensordot(np.linalg.inv(noise), products, 3)
         information = weighted[1:, 1:] + np.diag(precision)
-        factor = cho_factor(information)
+        try:
+            factor = cho_factor(information)
+        except np.linalg.LinAlgError:  # fewer coefficients than signals: what was found so far is all
+            break
         moves = cho_solve(factor, weighted[1:, 0] + pull)
         left = np.concatenate([[1.0], -moves])
         noise = (products @ left) @ left / data.band_size[:, None, None]

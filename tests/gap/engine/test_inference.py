@@ -203,3 +203,11 @@ def test_a_slow_force_that_nobody_asked_for_is_noise() -> None:
     found = infer(DriveData.of(log), effects=["dead_time", "sensor_bias"]).average
     assert found.label == "dead_time"
     assert not {"gust", "road_grade", "outliers"} & {n for label in found.probabilities for n in label.split("+")}
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_twenty_seconds_of_speed_alone_are_answered(seed: int) -> None:
+    """Fewer coefficients than a linear bank has signals."""
+    log = replace(recorded_log(seconds=20.0, seed=seed), accel=None)
+    found = infer(DriveData.of(log), effects=("aerodynamic_drag", "sensor_bias"), most=1).average
+    assert sum(found.probabilities.values()) == pytest.approx(1.0)
