@@ -78,8 +78,8 @@ plots.show(over_diagnosis.where_figure(found), OUT / "where.png")
 # %% [markdown]
 # Above: the stretch where the simulators with the effect (blue) and without it (orange) differ most, and the
 # measurement. Below: how the effect (blue) and the drive (grey) are distributed over time, speed and command. The
-# printed diagnosis has it in words where one part holds most of it. A part of the time, the speeds or the commands is named (and shaded) only where it holds nearly all of
-# the effect in far fewer rows.
+# printed diagnosis has it in words where one part holds most of it. A part of the time, the speeds or the commands is
+# named (and shaded) only where it holds nearly all of the effect in far fewer rows.
 
 # %%
 scores = found.shrinkage
@@ -92,8 +92,8 @@ if scores is not None:
     plots.show(over_diagnosis.shrinkage_figure(found), OUT / "shrinkage.png")
 
 # %% [markdown]
-# Free runs on held-out parts of the drive. Orange is the baseline simulator, blue the repaired one, light blue the noise
-# floor. Grey is the baseline with a black box, which learns what it can from the rest of the drive.
+# Free runs on held-out parts of the drive. Orange is the baseline simulator, blue the repaired one, light blue the
+# noise floor. Grey is the baseline with a black box, which learns what it can from the rest of the drive.
 #
 # ## The next experiment
 #
@@ -135,8 +135,8 @@ else:
     print("not distinguished:", ", ".join(both.verdict.alias_set))
 
 # %% [markdown]
-# Both drives are diagnosed together. The verdict stays, and lag and gain become far more certain. The probability of the
-# cause hardly rises, against the expectation, which takes the equations of the table for exact.
+# Both drives are diagnosed together. The verdict stays, and lag and gain become far more certain. The probability of
+# the cause hardly rises, against the expectation, which takes the equations of the table for exact.
 #
 # ## The truth
 
