@@ -1,8 +1,9 @@
 """Which changes explain how two sets of drives differ: a search among them, and the average of all visited sets.
 
 From one car on, the promise of each change is computed to first order; the best are fitted and valued, and the best of
-them stays while it gains. Evidence counts as everywhere: tempered, against the prior odds of one more effect. Here its
-temper is at most what the drives themselves allow, the variance by the likelihood over that by blocks and halves.
+them stays while it gains. Evidence is tempered, against the prior odds of one more effect, as everywhere. But here the
+temper is measured: two drives have blocks and halves, and what these disagree on, over what the likelihood says, is by
+how much the likelihood is too sure.
 """
 
 from __future__ import annotations
@@ -17,17 +18,19 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import EFFECTS
 from avtorch.gap.engine.joint import (
     NO_CHANGE,
+    SIZES,
     Change,
     JointFit,
     JointModel,
     gram,
+    nats_of,
     noise_left,
     of_car,
     of_effect,
     products,
 )
-from avtorch.gap.engine.likelihood import claimed, log_sum
-from avtorch.gap.engine.priors import EFFECT_NATS, TEMPER, UNKNOWN_NATS
+from avtorch.gap.engine.likelihood import log_sum
+from avtorch.gap.engine.priors import CLAIM_HZ, EFFECT_NATS, TEMPER, UNKNOWN_NATS
 from avtorch.gap.engine.shape_error import effect_energy, relative_size, shape_log_odds
 
 Progress = Callable[[str, int, int], None]
@@ -38,7 +41,6 @@ _FITTED = 6  # effects besides lag, gain and dead time
 _STARTS = 2  # of an effect
 _HELD = 0.9  # probability that an alias set holds
 _CREEPS_BELOW = 3.0  # [m/s]
-_SIZES = (0.03, 0.1, 0.35)  # of free forms that one side alone has
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,7 @@ class Scatter:
 
     @property
     def temper(self) -> float:
-        return min(TEMPER, self.likelihood / self.variance)
+        return self.likelihood / self.variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +163,7 @@ def search_changes(model: JointModel, changes: list[Change], progress: Progress 
 def scatter_of(model: JointModel, fit: JointFit, change: Change) -> Scatter:
     """Of a change's largest coordinate in a fit."""
     likelihood, blocks, drift = model.covariance(fit)
+    blocks = blocks * (model.blocks - 1) / max(model.blocks - 3, 1)  # of a variance from few blocks (Student)
     at = max(fit.at(change), key=lambda k: abs(fit.x[k]) / math.sqrt(likelihood[k, k]))
     return Scatter(float(likelihood[at, at]), float(blocks[at, at]), float(drift[at]))
 
@@ -287,7 +290,7 @@ def _own_forms(model: JointModel, fit: JointFit, acting: list[FloatArray]) -> fl
         gram(noise, p[..., 1 : n + 1, 1 : n + 1]) for noise, p in zip(fit.noise, P, strict=True)
     )
     best = -math.inf
-    for sd in _SIZES:
+    for sd in SIZES:
         noise = list(fit.noise)
         prior = np.zeros((n + count, n + count))
         prior[:n, :n] = precision
@@ -298,9 +301,11 @@ def _own_forms(model: JointModel, fit: JointFit, acting: list[FloatArray]) -> fl
             H = total[1:, 1:] + prior
             b = np.linalg.solve(H, total[1:, 0])
             left = np.append(1.0, -b)
-            noise = [noise_left(p, left, h.data) for p, h in zip(P, fit.sides, strict=True)]
-        low = sum(claimed(h.data, s) for h, s in zip(fit.sides, noise, strict=True)) - fit.claimed
-        whole = sum(claimed(h.data, s, math.inf) for h, s in zip(fit.sides, noise, strict=True)) - fit.log_likelihood
+            noise = [noise_left(p, left, h.data, k) for p, h, k in zip(P, fit.sides, model.known, strict=True)]
+        whole, low = (
+            sum(nats_of(h.data, s, k, fmax) for h, s, k in zip(fit.sides, noise, model.known, strict=True)) - before
+            for fmax, before in ((math.inf, fit.log_likelihood), (CLAIM_HZ, fit.claimed))
+        )
         occam = -count * math.log(sd) - 0.5 * float(np.linalg.slogdet(H)[1] - np.linalg.slogdet(fit.information)[1])
         best = max(best, min(low, whole) - 0.5 * float(b @ prior @ b) + occam)
-    return best - math.log(len(_SIZES))
+    return best - math.log(len(SIZES))

@@ -32,7 +32,7 @@ from avtorch.gap.engine.gauss_newton import jacobian, normal_prior
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import claimed, whiten
 from avtorch.gap.engine.outliers import sensor_outliers, without_outliers
-from avtorch.gap.engine.priors import ONE_CHANNEL_HZ
+from avtorch.gap.engine.priors import CLAIM_HZ, ONE_CHANNEL_HZ
 from avtorch.gap.engine.recorder import aligned, base_fit
 from avtorch.gap.simulator.plant import GapPlant
 
@@ -44,6 +44,10 @@ _STARTS = {"T_L": (0.0, 0.5, -0.5), "K_L": (0.0,), "dead_time": (0.0, 0.1, -0.1)
 _LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
 _FEWEST_FRAMES = 3
 _OUTLIER_NATS, _MOST_OUTLIERS = 10.0, 0.2  # as in `inference`
+NOISE_COUNTS = 4.0
+"""Coefficients that the noise of one car without free forms is worth, in each band: many forms would leave none."""
+SIZES = (0.03, 0.1, COEFFICIENT_SD)
+"""Prior standard deviations of free forms' coefficients, of which the likeliest stands [of the demand]."""
 _BLOCK_S, _FEWEST_BLOCKS = 10.0, 5
 NO_CHANGE = frozenset({"gain_change", "gain_change/drift", "gear_shift", "command_hold", "dead_time", "~linear"})
 """What is no change of a car between drives: of one drive, of chance, or a change of T_L, K_L and dead time."""
@@ -172,6 +176,7 @@ class JointModel:
     own_effects: frozenset[str] = frozenset()
     sd: float = COEFFICIENT_SD
     columns: tuple[FloatArray, FloatArray] = field(init=False, repr=False)
+    known: tuple[FloatArray, FloatArray] | tuple[None, None] = field(default=(None, None), repr=False)
     start: JointFit = field(init=False, repr=False)
 
     @classmethod
@@ -242,7 +247,15 @@ class JointModel:
         taken = np.linalg.solve(inner + np.diag(self._prior(bare.coordinates)[1]), cross)
         beyond = [s - np.tensordot(taken.T, j, 1) for s, j in zip(shapes, J, strict=True)]
         self._set_columns((beyond[0], beyond[1]))
-        self.start = self.evaluated(self.fit((), bare.x))
+        self.known = bare.noise
+        each = []
+        for self.sd in SIZES:
+            fit = self.fit((), bare.x)
+            H = self._system(fit, self._derivatives(fit))[0]
+            occam = -len(fit.c) * math.log(self.sd) - 0.5 * float(np.linalg.slogdet(H)[1])
+            each.append((fit.objective + occam, self.sd, fit))
+        _, self.sd, fit = max(each, key=lambda x: x[0])
+        self.start = self.evaluated(fit)
 
     def _set_columns(self, columns: tuple[FloatArray, FloatArray]) -> None:
         self.columns = columns
@@ -322,9 +335,11 @@ class JointModel:
             assert isinstance(total, np.ndarray)
             c = _solved(total[1:, 1:] + self.sd**-2 * np.eye(count), total[1:, 0])
             left = np.concatenate([[1.0], -c])
-            noise = [noise_left(P, left, h.data) for P, h in zip(sums, sides, strict=True)]
-        nats = sum(claimed(h.data, n, math.inf) for h, n in zip(sides, noise, strict=True))
-        low = sum(claimed(h.data, n) for h, n in zip(sides, noise, strict=True))
+            noise = [noise_left(P, left, h.data, k) for P, h, k in zip(sums, sides, self.known, strict=True)]
+        nats, low = (
+            sum(nats_of(h.data, n, k, fmax) for h, n, k in zip(sides, noise, self.known, strict=True))
+            for fmax in (math.inf, CLAIM_HZ)
+        )
         mean, precision = self._prior(coordinates)
         objective = nats - 0.5 * float(precision @ (x - mean) ** 2) - 0.5 * self.sd**-2 * float(c @ c)
         return JointFit(changes, coordinates, x, c, (sides[0], sides[1]), (noise[0], noise[1]), nats, low, objective)
@@ -527,12 +542,23 @@ def gram(noise: FloatArray, products: FloatArray) -> FloatArray:
     return np.asarray(np.tensordot(np.linalg.inv(noise), products, 3))
 
 
-def noise_left(products: FloatArray, left: FloatArray, data: DriveData) -> FloatArray:
-    """Covariance (band, channel, channel) of what is left of signal 0 of `products`."""
-    S = (products @ left) @ left / data.band_size[:, None, None]
+def noise_left(products: FloatArray, left: FloatArray, data: DriveData, known: FloatArray | None) -> FloatArray:
+    """Covariance (band, channel, channel) of what is left of signal 0 of `products`, `known` worth `NOISE_COUNTS`."""
+    S = (products @ left) @ left
+    count = data.band_size[:, None, None]
+    S = S / count if known is None else (S + NOISE_COUNTS * known) / (count + NOISE_COUNTS)
     S = 0.5 * (S + np.swapaxes(S, 1, 2))
     trace = np.trace(S, axis1=1, axis2=2)
     return S + (_LEAST * trace)[:, None, None] * np.eye(data.channel_count)
+
+
+def nats_of(data: DriveData, noise: FloatArray, known: FloatArray | None, fmax: float = math.inf) -> float:
+    """Nats of the bands that begin below `fmax` [Hz], the noise integrated out under its prior."""
+    nats = claimed(data, noise, fmax)
+    if known is None:
+        return nats
+    n = max(int(np.searchsorted(data.frequency[data.band_edges[:-1]], fmax)), 1)
+    return nats - 0.5 * NOISE_COUNTS * float(np.linalg.slogdet(noise[:n])[1].sum())
 
 
 def _solved(A: FloatArray, b: FloatArray) -> FloatArray:

@@ -24,7 +24,6 @@ from avtorch.gap.engine.changes import (
 from avtorch.gap.engine.coordinates import adopt
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.joint import Change, JointFit, JointModel, of_car
-from avtorch.gap.engine.priors import TEMPER
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import DeadTimeTest
 from avtorch.gap.simulator.effect import Effect
@@ -137,14 +136,14 @@ def _of_effect(h: Hypothesis, change: Change) -> dict[str, float]:
 def _detectable(model: JointModel) -> dict[str, float]:
     """The least change of T_L and K_L (share) and of dead time [s] that would show in nine of ten such drives.
 
-    It is the change of one, nothing else changing: 4 standard errors, by the likelihood as it is tempered or by blocks.
+    It is the change of one, nothing else changing: 4 standard errors, by the likelihood or by blocks.
     """
     out = {}
     for name in ("T_L", "K_L", *(["dead_time"] if "dead_time" in model.base.effects else [])):
         change = of_car(name)
         fit = model.evaluated(model.at((change,), np.append(model.start.x, 0.0)))
         scatter = scatter_of(model, fit, change)
-        error = math.sqrt(max(scatter.blocks, scatter.likelihood / TEMPER))
+        error = math.sqrt(max(scatter.blocks, scatter.likelihood))
         out[name] = _ERRORS * error if any(d[-1].any() for d in fit.derivatives) else math.inf
     return out
 
