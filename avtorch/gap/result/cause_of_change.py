@@ -96,6 +96,7 @@ def _parameters(found: ChangePosterior, change: Change) -> dict[str, Quantity]:
     """By blocks of both sides, and by what comes and goes between the halves of one."""
     fit, model = found.best.fit, found.model
     likelihood, blocks, drift = model.covariance(fit)
+    blocks = blocks + 1e-9 * np.diag(np.diag(likelihood))  # also of what stands at a limit
     at, sure = fit.at(change), _sure(model)
     spread = blocks * np.sqrt(np.outer(*2 * [np.maximum(np.diag(likelihood) / np.diag(blocks), 1.0)]))
     spread[at, at] += drift[at]
