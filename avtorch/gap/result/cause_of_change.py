@@ -106,8 +106,9 @@ def _parameters(found: ChangePosterior, change: Change) -> dict[str, Quantity]:
     for k in range(len(fit.x)):
         x = fit.x.copy()
         x[k] += step[k]
-        for key, value in _reported(model, fit, change, x).items():
-            slopes[key].append((value - here[key]) / step[k])
+        moved = _reported(model, fit, change, x)
+        for key, value in here.items():  # a limit out of reach has no size
+            slopes[key].append((moved.get(key, value) - value) / step[k])
     sds = {key: math.sqrt(max(float(np.array(s) @ spread @ np.array(s)), 0.0)) for key, s in slopes.items()}
     return {key: Quantity(x, sds[key], x - sure * sds[key], x + sure * sds[key]) for key, x in here.items()}
 
