@@ -5,12 +5,14 @@ import pytest
 import torch
 
 from avtorch import diagnose
+from avtorch.gap import DeadTime
 from avtorch.gap.compare import compare
 from avtorch.gap.effects.speed_dependent_gain import SpeedDependentGain
 from avtorch.gap.effects.speed_dependent_lag import SpeedDependentLag
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.simulator.simulator_input import SimulatorInput
 from avtorch.io import Log
+from tests.gap.cars import log_of
 
 TIME = np.arange(1200) * 0.05
 MEAN_SPEED = 25.0
@@ -74,3 +76,11 @@ def test_a_comparison_keeps_them() -> None:
     read = noisy(log)
     other = plant([SpeedDependentGain(0.3, mean_speed=MEAN_SPEED)], T_L=0.4, K_L=0.9)
     assert compare(read, read, baseline=other, baseline_after=car, effects=[]).simulator == "closer"
+
+
+def test_what_a_baseline_lacks_is_found_where_the_compiled_plant_lacks_the_baseline() -> None:
+    """A gain that changes is tried, too: its moment is in its own equation."""
+    log = log_of([SpeedDependentGain(0.3, 12.0), DeadTime(0.3)], seed=12)
+    baseline = plant([SpeedDependentGain(0.3, 12.0)])
+    found = diagnose(log, baseline=baseline, effects=["dead_time", "gain_change"], pairs=False)
+    assert "dead_time" in found.verdict.names

@@ -105,8 +105,11 @@ def simulator_signals(h: Car, values: FloatArray, onsets: FloatArray | None = No
     acts = h.onset_vector() if onsets is None else onsets
     with_all = h.copy()
     with_all.values = values
-    accel, gained = _signals(with_all)
     time = h.data.grid.time
+    if "gain_change" in h.effects:  # has its moment in its own equation
+        onset = float(acts[INDEX[EFFECTS["gain_change"].coordinates[0].name]])
+        with_all.onsets["gain_change"] = max(onset, float(time[0]))
+    accel, gained = _signals(with_all)
     for e in h.effects:
         own = EFFECTS[e].coordinates
         since = acts[INDEX[own[0].name]] if own else -np.inf

@@ -312,18 +312,19 @@ def promises(h: Hypothesis, candidates: Sequence[EngineEffect]) -> list[Promise]
                     p[INDEX[c.name]] = x
                 if kept:  # a lag hides most of a delay
                     p[0] = max(p[0] - 0.8 * start[0], min(p[0], 0.06))
-                # the simulator runs a user's own effect only where a hypothesis has it
-                rows = (h if e.kind is None else h.with_effect(e.name, start)).rows(p)
+                # the simulator runs an effect only where a hypothesis has it
+                beside = h if e.kind is None and h.baseline is None else h.with_effect(e.name, start)
+                rows = beside.rows(p)
                 change = h.data.transform(rows) - h.predicted
                 whitened = whiten(h.data, h.covariance, change)
                 if not kept:
-                    always += _by_slope(h, projection, e, start)
+                    always += _by_slope(beside, projection, e, start)
                 if e.onset != "must":
                     always += _whole(h, projection, e, start, whitened)
                 if e.onset != "never":
                     steps = sum(z * (a - b) for z, a, b in zip(adjoint, rows, response, strict=True))
                     assert isinstance(steps, np.ndarray)
-                    later += _onsets(h, projection, e, start, p, whitened, steps)
+                    later += _onsets(beside, projection, e, start, p, whitened, steps)
         always.sort(key=lambda x: -x.nats)
         later.sort(key=lambda x: -x.nats)
         if always and later and later[0].nats < always[0].nats - 1:
