@@ -3,7 +3,9 @@
 Beside its effects every hypothesis may have a slow random force (gust or road), outliers of the accelerometer, and a
 free form of some family; all are valued in nats of the same likelihood. Each such composition supports labels. Its own
 is its effects by name. But an effect may be an error of the shape of the others, and then the label is without it; a
-free form may be that, too, or a cause without a name, `unknown`. Labels add up what supports them:
+free form may be that, too, or a cause without a name, `unknown`. A force map of the base is a part without a name beside
+those that have one; so is, in front of it, any other free form, and `unknown` is the label where no part has a name.
+Labels add up what supports them:
 
     P(label) ~ sum exp(TEMPER (log evidence + log odds))
 """
@@ -30,13 +32,14 @@ from avtorch.gap.engine.priors import (
     SLOW_FORCE_NATS,
     TEMPER,
     UNKNOWN_NATS,
+    WITHIN_NATS,
 )
 from avtorch.gap.engine.search import Search
 from avtorch.gap.engine.shape_error import log_prior, relative_size, shape_likelihood, shape_log_odds
 from avtorch.gap.engine.slow_forces import SlowForces, band_covariance, gust_onset, pulling_lags, slow_forces
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
-_EXAMINED, _WITHIN = 8, 25.0  # hypotheses, and nats of score behind the best, that are examined in full
+_EXAMINED = 8  # hypotheses that are examined in full
 _LINEAR = frozenset({"dead_time", "second_order_actuator", "sensor_lag"})
 _FAINT_GUST = FAINT_OF_RANGE * TABLE["gust"].parameters[0].low
 _LARGE_OF_COMMAND = 0.2  # a slow force has a name, with one channel, from this share of the command's spread on
@@ -96,12 +99,14 @@ class Weight:
 class ModelAverage:
     """Probabilities of labels ("none", "unknown", effects joined by "+" in alphabetical order), and what supports them.
 
-    `probabilities` sum to 1, the most probable first; `best`: the strongest support of each label.
+    `probabilities` sum to 1, the most probable first; `best`: the strongest support of each label. `force_maps`:
+    probability of each form of a force map in the base, by its name.
     """
 
     probabilities: Mapping[str, float]
     best: Mapping[str, Weight]
     examined: tuple[Examined, ...]
+    force_maps: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
@@ -117,7 +122,7 @@ def examined_sets(search: Search) -> list[Examined]:
     """The best visited sets, the base, and the best single effects, examined."""
     ranked = [h for h in search.visited.values() if _acts(h)]
     ranked.sort(key=lambda h: -_ranking(h))
-    chosen = [h for h in ranked if _ranking(h) > _ranking(ranked[0]) - _WITHIN][:_EXAMINED]
+    chosen = [h for h in ranked if _ranking(h) > _ranking(ranked[0]) - WITHIN_NATS][:_EXAMINED]
     for h in [
         search.visited[search.key(search.base)],
         *[h for h in ranked if len(h.effects) == len(search.base.effects) + 1][:2],
@@ -130,7 +135,9 @@ def examined_sets(search: Search) -> list[Examined]:
 def examine(h: Hypothesis, search: Search) -> Examined:
     """Everything that may be beside the effects of one hypothesis, in nats."""
     data, alone = h.data, search.alone
-    forms = {name: block(h, form) for name, form in families(h).items()}
+    # where bases have a map, it is there that a map stands beside these effects
+    others = {name: form for name, form in families(h).items() if name != "map" or not search.map_bases}
+    forms = {name: block(h, form) for name, form in others.items()}
     mirror = 0.0
     if not alone and data.channel_count == 2 and (forms["linear"].nats > 0 or _LINEAR & set(h.names)):
         mirror = max(block(h, mirror_columns(h)).nats, 0.0)
@@ -191,9 +198,12 @@ def average(
         ]
     total: dict[str, list[float]] = {"none": [], "unknown": []}
     best: dict[str, Weight] = {}
+    bases: dict[str, list[float]] = {}
     for w in weights:
         given = _given(w.label, prior or {})
         total.setdefault(w.label, []).append(TEMPER * w.log_weight + given)
+        force = w.examined.hypothesis.force
+        bases.setdefault("" if force is None else force.name, []).append(total[w.label][-1])
         if w.label not in best or best[w.label].log_weight < w.log_weight:
             best[w.label] = w
     logs = {label: log_sum(x) if x else -np.inf for label, x in total.items()}
@@ -204,7 +214,9 @@ def average(
     listed = {k: max(v, _LEAST_LISTED) for k, v in listed.items()}
     whole = sum(listed.values())
     ordered = sorted(listed.items(), key=lambda kv: -kv[1])
-    return ModelAverage({k: v / whole for k, v in ordered}, best, tuple(examined))
+    each = {form: log_sum(x) for form, x in bases.items()}
+    maps = {form: math.exp(x - log_sum(list(each.values()))) for form, x in each.items() if form}
+    return ModelAverage({k: v / whole for k, v in ordered}, best, tuple(examined), maps)
 
 
 # inside ---------------------------------------------------------------------------------------------------------------
@@ -275,7 +287,7 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
     names = sorted({base_name(e) for e in named})
     count = sum(not e.startswith("~") for e in h.effects)
     each = EFFECT_NATS_ALONE if alone else EFFECT_NATS
-    odds = -each * count
+    odds = -each * count - (UNKNOWN_NATS if h.force is not None else 0.0)
     # outliers that other sets explain are none: more effects may not make more of them
     spikes = [
         y.outliers.nats for y in examined if y.outliers is not None and set(y.hypothesis.effects) <= set(h.effects)
@@ -293,7 +305,8 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
         if x.mirror:
             labels += _echoes(x, names)
         if c.form:
-            labels = [(None, -UNKNOWN_NATS)] + [
+            beside = names if h.force is not None and names else None
+            labels = [(beside, -UNKNOWN_NATS)] + [
                 (label, worth + shape_log_odds(c.relative, c.nats, h.effects)) for label, worth in labels
             ]
         total, kinds = dict(c.total), SLOW
@@ -313,7 +326,7 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
             for outliers in (False, True) if np.isfinite(spike) else (False,):
                 more = spike - OUTLIER_NATS if outliers else 0.0
                 text = "unknown"
-                if causes is not None:
+                if causes is not None and (causes or outliers or h.force is None):
                     text = "+".join(sorted([*causes, *(["outliers"] if outliers else [])])) or "none"
                 evidence = total[slow] + (spike if outliers else 0.0)
                 yield Weight(text, total[slow] + value + more, evidence, x, c, slow, outliers)

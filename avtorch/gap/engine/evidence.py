@@ -3,7 +3,7 @@
     log E = min(gain below 10 Hz, gain of the whole band) + log integral over errors of shape + log prior
             + d/2 log 2 pi - 1/2 log det H
 
-Gains are over the base, the hypothesis without effects. Sizes have a heavy-tailed prior (Student, three degrees of
+Gains are over the base, the hypothesis without effects and without a force map. Sizes have a heavy-tailed prior (Student, three degrees of
 freedom) that vanishes where an effect would make no difference (non-local; Johnson and Rossell 2010).
 """
 
@@ -14,9 +14,9 @@ import math
 import numpy as np
 
 from avtorch.gap.engine.coordinates import COORDINATES, EFFECTS, INDEX
-from avtorch.gap.engine.gauss_newton import jacobian, normal_prior, prior_terms, whitened_jacobian
+from avtorch.gap.engine.gauss_newton import linearised, normal_prior, whitened_jacobian
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import claimed, log_sum
+from avtorch.gap.engine.likelihood import claimed, freedom, log_sum
 from avtorch.gap.engine.priors import LOST_NATS, ONSET_ODDS, SHIFT_NATS, TRIED_NATS
 from avtorch.gap.engine.shape_error import effect_energy, log_prior, shape_likelihood
 
@@ -49,23 +49,33 @@ def evaluate_evidence(h: Hypothesis) -> Hypothesis:
     """Sets what `Hypothesis` says, of an evaluated hypothesis over its base; returns it."""
     base = h.base or h
     names = h.free
-    h.jacobian = jacobian(h, names)
+    h.jacobian, precision, _ = linearised(h, names)
     W = whitened_jacobian(h, h.jacobian)
-    h.information = W @ W.T + np.diag(prior_terms(h, names)[0])
+    h.information = W @ W.T + np.diag(precision)
     h.claimed = claimed(h.data, h.covariance)
-    base_claimed = claimed(base.data, base.covariance)
+    first = base.plain or base
+    first_claimed = claimed(first.data, first.covariance)
     h.effect_energy, h.shape, h.shape_log = None, None, np.zeros(1)
     if h.effects and h.predicted.shape == base.predicted.shape:
         h.effect_energy = effect_energy(h.data, h.predicted - base.predicted)
         h.shape = shape_likelihood(h.data, h.residual, h.effect_energy)
     if h.shape is not None:
         h.shape_log = h.shape.nats + log_prior(h.effects)
-    gain = min(h.claimed - base_claimed, h.log_likelihood - base.log_likelihood)
+    gain = min(h.claimed - first_claimed, h.log_likelihood - first.log_likelihood)
     volume = len(names) * _HALF_LOG_2PI - 0.5 * float(np.linalg.slogdet(h.information)[1])
-    h.evidence = gain + log_sum(h.shape_log) + log_prior_density(h) + volume + _onset_odds(h)
+    h.evidence = gain + log_sum(h.shape_log) + log_prior_density(h) + volume + _onset_odds(h) + _force_density(h)
     h.evidence -= LOST_NATS * len(h.lost) + SHIFT_NATS * len(h.shift_speeds) * ("gear_shift" in h.effects)
-    h.score = h.evidence - TRIED_NATS * len(h.effects)
+    h.score = h.evidence - TRIED_NATS * (len(h.effects) + (h.force is not None))
     return h
+
+
+def _force_density(h: Hypothesis) -> float:
+    """Log density of the coefficients of a force map, whose 2 pi the volume has not, and of its sizes."""
+    if h.force is None:
+        return 0.0
+    b, size = h.force_coefficients, h.force.size
+    free = 0.0 if h.force_spread is None else freedom(h.data, h.covariance, h.force_spread)
+    return h.force.size_nats + 0.5 * free - 0.5 * float(b @ b) / size**2 - len(b) * math.log(size)
 
 
 def _student(z: float) -> float:

@@ -3,8 +3,8 @@ r"""What no named effect explains: free forms of a family, linear in their coeff
     R = J delta + sum_j beta_j z_j + n,     beta ~ N(0, sd^2),     delta ~ the engine's priors,
 
 R is the residual of a hypothesis in lapped coefficients, J its Jacobian, so that every named parameter may move again,
-and z_j the response of all channels to a demand of a form: other lags (dynamics), other lags by sign, hinges of the
-command times hats of the speed (force map), a sine (tone), a gain or a delay that wanders as an Ornstein-Uhlenbeck
+and z_j the response of all channels to a demand of a form: other lags (dynamics), other lags by sign, curves over
+command and speed (force map), a sine (tone), a gain or a delay that wanders as an Ornstein-Uhlenbeck
 process over the frames. The noise's covariance stays free in every band, as in `likelihood`; coefficients are
 integrated out by Laplace's approximation. A form's gain is the lesser of that below `CLAIM_HZ` and that of all bands,
 as everywhere: a closed loop's echoes cancel over the whole band only (Ljung 1999, section 13.4).
@@ -29,9 +29,10 @@ from scipy.ndimage import median_filter
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.gauss_newton import prior_terms
+from avtorch.gap.engine.force_map import MAP_SIZES, MapForm, map_forms, size_log_prior
+from avtorch.gap.engine.gauss_newton import linear_priors
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import claimed, log_likelihood, whiten
+from avtorch.gap.engine.likelihood import claimed, freedom, log_likelihood, log_sum, whiten
 
 COEFFICIENT_SD = 0.35
 """Prior sd of a form's coefficient [of the demand; a tone's: m/s^2]: a third of what the command asks for."""
@@ -39,14 +40,6 @@ LAG_RATIOS = (0.3, 1.0, 3.0, 10.0)
 """Lags of a linear bank over the car's own [-]: half a decade apart, and twice that at the slow end."""
 SHORTEST_LAG_S = 0.03
 """Shortest lag of a bank [s]; what is faster belongs to the recorder."""
-SPEED_QUANTILES = (0.02, 0.35, 0.65, 0.98)
-"""Knots of the force map along the speed: the ends of what was driven, and its thirds."""
-SPEED_SPAN_MPS = 2.0
-"""Least distance [m/s] of the outer knots at which a dependence on speed is a question at all."""
-HINGE_QUANTILES = (0.6, 0.9)
-"""Hinges of the force map on each side of the command: at these quantiles of what was asked for."""
-IDLE_MPS2 = 0.02
-"""Demand [m/s^2] below which nothing is asked for; a hundredth of a brisk one."""
 WANDER_SD = {"gain": 0.2, "delay": 0.12}
 """Typical sd of a wandering gain [-] and of a wandering delay [s]."""
 WANDER_RATIOS = (0.3, 1.0, 2.0)
@@ -66,24 +59,27 @@ class FreeForm:
     """A linear family: `columns` (column, channel, frame, bin) are the responses to its demands of coefficient one.
 
     `family`: where it acts ("force map", "dynamics", "time", "recorder"); `terms` (column,): each demand in words.
+    `sizes`: prior standard deviations of a coefficient, each with its log prior probability.
     """
 
     name: str
     family: str
     columns: FloatArray = field(repr=False)
     terms: tuple[str, ...] = field(repr=False)
+    sizes: tuple[tuple[float, float], ...] = ((COEFFICIENT_SD, 0.0),)
 
 
 class FreeFormFit(NamedTuple):
     """Evidence of a free form beside a hypothesis.
 
     `nats` over the hypothesis without it; `residual` (channel, frame, bin) that is left, None where nothing can be
-    told; `coefficients` (column,) of the form, or the course (frame,) of what wanders.
+    told; `coefficients` (column,) of the form, or the course (frame,) of what wanders; `size` the likeliest of the form.
     """
 
     nats: float
     residual: FloatArray | None
     coefficients: FloatArray
+    size: float = COEFFICIENT_SD
 
 
 class Tone(NamedTuple):
@@ -95,7 +91,8 @@ class Tone(NamedTuple):
 
 
 def families(h: Hypothesis) -> dict[str, FreeForm]:
-    """The free forms of dynamics ("linear", "sided") and of the force map ("map", where the speed is known)."""
+    """The free forms of dynamics ("linear", "sided") and of the force ("map", where the speed is known and the base has
+    no map of its own)."""
     u = h["K_L"] * h.command()
     short, own, long, longest = _bank(h)
     rate = own * np.diff(u, prepend=u[:1]) / h.data.dt  # a lead as long as the lag, in m/s^2
@@ -104,9 +101,18 @@ def families(h: Hypothesis) -> dict[str, FreeForm]:
     demands: dict[tuple[str, str], list[tuple[str, FloatArray, float]]] = {
         ("linear", "dynamics"): [*(("u", u, lag) for lag in (short, long, longest)), ("slope of u", rate, own)],
         ("sided", "dynamics"): [("u > 0", up, lag) for lag in (short, long, longest, own)],
-        ("map", "force map"): [(term, w, own) for term, w in _map_demands(h.data, u)],
     }
-    return {name: _form(h, name, family, each) for (name, family), each in demands.items() if each}
+    forms = {name: _form(h, name, family, each) for (name, family), each in demands.items()}
+    if h.force is None and (maps := map_forms(h.data)):
+        forms["map"] = map_free_form(h, maps[-1])
+    return forms
+
+
+def map_free_form(h: Hypothesis, form: MapForm) -> FreeForm:
+    """The curves of a force map as a form beside a hypothesis without one."""
+    columns = demand_response(h, form.demands, np.full(form.count, h["T_L"]))
+    sizes = tuple(zip(MAP_SIZES.tolist(), size_log_prior().tolist(), strict=True))
+    return FreeForm("map", "force map", columns, tuple(f"curve {k + 1}" for k in range(form.count)), sizes)
 
 
 def mirror_columns(h: Hypothesis) -> FreeForm:
@@ -117,24 +123,29 @@ def mirror_columns(h: Hypothesis) -> FreeForm:
     return FreeForm("mirror", "recorder", columns, tuple(f"lag -{lag:.2f} s" for lag in lags))
 
 
-def block(h: Hypothesis, form: FreeForm, sd: float = COEFFICIENT_SD, iterations: int = 4) -> FreeFormFit:
-    """Evidence of a linear form beside `h`, whose parameters may move again.
+def block(h: Hypothesis, form: FreeForm, iterations: int = 4) -> FreeFormFit:
+    """Evidence of a linear form beside `h`, whose parameters may move again, summed over the form's sizes.
 
-    `h`: with its evidence evaluated (`jacobian`, `information`). `sd`: of the prior on each coefficient. `iterations`:
-    alternations between coefficients and noise; the best is the answer.
+    `h`: with its evidence evaluated (`jacobian`, `information`). `iterations`: alternations between coefficients and
+    noise; the best is the answer.
     """
-    names = h.free
-    precision, pull = prior_terms(h, names)
+    precision, pull = linear_priors(h, h.free)
+    known = len(h.jacobian)
     products = band_products(h.data, np.concatenate([h.residual[None], np.asarray(h.jacobian), form.columns]))
-    without, _ = _linear_evidence(h, products[..., : 1 + len(names), : 1 + len(names)], precision, pull, 2)
+    without, _ = linear_evidence(h, products[..., : 1 + known, : 1 + known], precision, pull, 2)
     without = max(without, -0.5 * float(np.linalg.slogdet(h.information)[1]))
     count = len(form.columns)
-    precision = np.concatenate([precision, np.full(count, sd**-2)])
     pull = np.concatenate([pull, np.zeros(count)])
-    value, moves = _linear_evidence(h, products, precision, pull, iterations)
-    value -= count * math.log(sd)
-    taken = np.tensordot(moves[: len(names)], h.jacobian, 1) + np.tensordot(moves[len(names) :], form.columns, 1)
-    return FreeFormFit(value - without, h.residual - taken, moves[len(names) :])
+    nats: list[float] = []
+    best, size = np.zeros(known + count), form.sizes[0][0]
+    for sd, log_prior in form.sizes:
+        tight = np.concatenate([precision, np.full(count, sd**-2)])
+        value, moves = linear_evidence(h, products, tight, pull, iterations, count if form.family == "force map" else 0)
+        nats.append(value - count * math.log(sd) + log_prior - without)
+        if nats[-1] == max(nats):
+            best, size = moves, sd
+    taken = np.tensordot(best[:known], h.jacobian, 1) + np.tensordot(best[known:], form.columns, 1)
+    return FreeFormFit(log_sum(nats), h.residual - taken, best[known:], size)
 
 
 def wandering(h: Hypothesis) -> dict[str, FreeFormFit]:
@@ -229,17 +240,24 @@ def band_products(data: DriveData, x: FloatArray) -> FloatArray:
     return out
 
 
-def _linear_evidence(
-    h: Hypothesis, products: FloatArray, precision: FloatArray, pull: FloatArray, iterations: int
+def linear_evidence(
+    h: Hypothesis,
+    products: FloatArray,
+    precision: FloatArray,
+    pull: FloatArray,
+    iterations: int,
+    integrated: int = 0,
 ) -> tuple[float, FloatArray]:
     """Gain [nats] of signals 1, 2, ... of `products` in explaining signal 0, and their coefficients.
 
     Coefficients have the prior exp(pull' b - b' diag(precision) b / 2), whose own normalisation is left out. The gain
-    contains that of the likelihood over `h`, the prior's change, and -1/2 log det of the posterior's precision.
+    contains that of the likelihood over `h`, the prior's change, and -1/2 log det of the posterior's precision. The
+    last `integrated` coefficients are so many that the noise needs what they may be wrong by (`log_likelihood`).
     """
     data, noise = h.data, h.covariance
     before = claimed(data, noise), h.log_likelihood
     best, at = -math.inf, np.zeros(len(precision))
+    spread = np.zeros_like(noise) if integrated or h.force_spread is None else h.force_spread
     for _ in range(iterations):
         weighted = np.tensordot(np.linalg.inv(noise), products, 3)
         information = weighted[1:, 1:] + np.diag(precision)
@@ -250,8 +268,12 @@ def _linear_evidence(
         moves = cho_solve(factor, weighted[1:, 0] + pull)
         left = np.concatenate([[1.0], -moves])
         noise = (products @ left) @ left / data.band_size[:, None, None]
-        noise += _LEAST * np.trace(noise, axis1=1, axis2=2)[:, None, None] * np.eye(data.channel_count)
+        if integrated:
+            unsure = cho_solve(factor, np.eye(len(precision)))[-integrated:, -integrated:]
+            spread = np.tensordot(products[..., -integrated:, -integrated:], unsure, 2) / data.band_size[:, None, None]
+        noise += spread + _LEAST * np.trace(noise, axis1=1, axis2=2)[:, None, None] * np.eye(data.channel_count)
         gain = min(claimed(data, noise) - before[0], claimed(data, noise, math.inf) - before[1])
+        gain += 0.5 * freedom(data, noise, spread) if integrated else 0.0
         gain += float(pull @ moves - 0.5 * precision @ moves**2) - float(np.log(np.diag(factor[0])).sum())
         if gain > best:
             best, at = gain, moves
@@ -267,23 +289,6 @@ def _form(h: Hypothesis, name: str, family: str, demands: Sequence[tuple[str, Fl
     """A form from its demands: what each is, its rows (row,), and the lag [s] behind it."""
     columns = demand_response(h, np.array([w for _, w, _ in demands]), np.array([lag for *_, lag in demands]))
     return FreeForm(name, family, columns, tuple(f"{term}, lag {lag:.2f} s" for term, _, lag in demands))
-
-
-def _map_demands(data: DriveData, u: FloatArray) -> list[tuple[str, FloatArray]]:
-    """Demands of the force map: each side of the command times hats of the speed, and hinges on each side."""
-    if data.speed is None:
-        return []
-    knots = np.quantile(data.smooth_speed, SPEED_QUANTILES)
-    demands = []
-    for side, sign in (("u > 0", 1.0), ("u < 0", -1.0)):
-        size = np.maximum(sign * u, 0.0)
-        if knots[-1] - knots[0] > SPEED_SPAN_MPS:
-            hats = (np.interp(data.smooth_speed, knots, unit) for unit in np.eye(len(knots)))
-            demands += [(f"{side}, {v:.1f} m/s", sign * size * hat) for v, hat in zip(knots, hats, strict=True)]
-        asked = size[size > IDLE_MPS2]
-        for at in np.quantile(asked, HINGE_QUANTILES) if len(asked) else ():
-            demands.append((f"{side}, beyond {sign * at:.2f} m/s^2", sign * np.maximum(size - at, 0.0)))
-    return demands
 
 
 def _first_order_backwards(
@@ -315,7 +320,7 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float, iterations: int =
     """
     data = h.data
     frames = data.frame_count
-    precision, pull = prior_terms(h, h.free)
+    precision, pull = linear_priors(h, h.free)
     between = np.abs(data.frame_time[:, None] - data.frame_time)
     centre = np.eye(frames) - 1.0 / frames
     priors = [centre @ ((ratio * sd) ** 2 * np.exp(-between / s)) @ centre for ratio in WANDER_RATIOS for s in WANDER_S]
@@ -325,7 +330,7 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float, iterations: int =
         return np.moveaxis(whiten(data, noise, x).reshape(shape), 1, 0).reshape(frames, -1)
 
     def gain(moves: FloatArray, left: FloatArray) -> tuple[float, FloatArray]:
-        total, after = log_likelihood(data, left)
+        total, after = log_likelihood(data, left, h.force_spread)
         over = min(claimed(data, after) - claimed(data, h.covariance), total - h.log_likelihood)
         return over + float(pull @ moves - 0.5 * precision @ moves**2), after
 

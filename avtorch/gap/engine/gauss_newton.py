@@ -13,7 +13,7 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import COORDINATES, INDEX
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import whiten
+from avtorch.gap.engine.likelihood import band_covariance, log_likelihood, whiten
 from avtorch.gap.engine.priors import RECORDER_DELAY_S, RECORDER_FILTER_S
 
 _RECORDER = {
@@ -23,6 +23,9 @@ _RECORDER = {
 }
 _STEPS = {"T_L": 0.01, "K_L": 0.005} | dict.fromkeys(_RECORDER, 0.004)  # of finite differences
 _BASE = {"T_L": (math.log(0.3), 1.5), "K_L": (1.0, 0.5)}  # wide: only a fit without information feels them
+_LATE = ("T_L", "dead_time", "sensor_lag", "accel_delay", "speed_delay", "accel_filter", "speed_filter", "square_period")
+_LATER = 0.1  # of the lag: a change of timing from which the columns of a force map are computed anew
+_FORCE_STEP = 0.05  # of a coefficient of a force map, in the finite difference
 _WIDE = 4.0  # a fit's normal prior of a size, over the scale of its Student prior
 
 
@@ -52,12 +55,14 @@ def prior_terms(h: Hypothesis, names: Sequence[str]) -> tuple[FloatArray, FloatA
 
 
 def penalty(h: Hypothesis, names: Sequence[str]) -> float:
-    """Log density of the normal priors, without constants [nats]."""
+    """Log density of the normal priors, that of a force map among them, without constants [nats]."""
     total = 0.0
     for name in names:
         mean, sd = normal_prior(name, h.neutral[INDEX[name]])
         x = math.log(h[name]) if name == "T_L" else h[name]
         total -= 0.5 * ((x - mean) / sd) ** 2
+    if h.force is not None:
+        total -= 0.5 * float(h.force_coefficients @ h.force_coefficients) / h.force.size**2
     return total
 
 
@@ -93,6 +98,57 @@ def jacobian(h: Hypothesis, names: Sequence[str]) -> FloatArray:
     return out
 
 
+def linear_priors(h: Hypothesis, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+    """Precision and pull (unknown,) of the normal priors of the parameters `names` and then of the coefficients of the
+    force map, where there is one."""
+    precision, pull = prior_terms(h, names)
+    if h.force is None:
+        return precision, pull
+    tight = np.full(h.force.count, h.force.size**-2)
+    return np.concatenate([precision, tight]), np.concatenate([pull, -tight * h.force_coefficients])
+
+
+def linearised(h: Hypothesis, names: Sequence[str]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Derivatives (unknown, channel, frame, bin) by the same unknowns, with precision and pull of their priors."""
+    slopes = jacobian(h, names)
+    if h.force is not None:
+        slopes = np.concatenate([slopes, force_columns(h)])
+    return slopes, *linear_priors(h, names)
+
+
+def force_columns(h: Hypothesis) -> FloatArray:
+    """Derivatives (curve, channel, frame, bin) by the coefficients of the force map, of an evaluated hypothesis.
+
+    They are those of an earlier place as long as the response there was as late as it is now: their scale is right
+    then, and least squares need no more.
+    """
+    assert h.force is not None
+    late = np.array([h.values[INDEX[name]] for name in _LATE])
+    late[-1] = math.sqrt(max(late[-1], 0.0))
+    if h.force_columns is not None:
+        there, columns = h.force_columns
+        if np.abs(there - late).max() < _LATER * late[0] and columns.shape[1:] == h.predicted.shape:
+            return columns
+    moved, columns = h.copy(), np.empty((h.force.count, *h.predicted.shape))
+    for k in range(h.force.count):
+        moved.force_coefficients = h.force_coefficients.copy()
+        moved.force_coefficients[k] += _FORCE_STEP
+        columns[k] = (moved.response() - h.predicted) / _FORCE_STEP
+    h.force_columns = late, columns
+    return columns
+
+
+def spread_of(h: Hypothesis, information: FloatArray) -> FloatArray | None:
+    """Mean square (band, channel, channel) in the response of what the coefficients of the force map may be wrong by;
+    `information` (unknown, unknown): of all unknowns, the coefficients last. None without a map."""
+    if h.force is None:
+        return None
+    covariance = np.linalg.inv(information)[-h.force.count :, -h.force.count :]
+    sizes, turn = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    columns = np.tensordot((turn * np.sqrt(np.maximum(sizes, 0.0))).T, force_columns(h), 1)
+    return np.sum([band_covariance(h.data, column) for column in columns], axis=0)
+
+
 def whitened_jacobian(h: Hypothesis, derivatives: FloatArray) -> FloatArray:
     """Derivatives in units of the noise, (parameter, coefficient)."""
     return np.array([whiten(h.data, h.covariance, j) for j in derivatives])
@@ -107,18 +163,27 @@ def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05, names: Sequ
     names = h.free if names is None else list(names)
     at = [INDEX[n] for n in names]
     low, high = np.array([h.limits(n) for n in names]).T
+    boundless = np.full(len(h.force_coefficients), np.inf)
+    low, high = np.concatenate([low, -boundless]), np.concatenate([high, boundless])
     h.evaluate()
     current, damping = h.log_likelihood + penalty(h, names), 1e-3
     for _ in range(iterations):
-        W = whitened_jacobian(h, jacobian(h, names))
-        precision, pull = prior_terms(h, names)
+        slopes, precision, pull = linearised(h, names)
+        W = whitened_jacobian(h, slopes)
         H = W @ W.T
+        if h.force is not None:
+            h.force_spread = spread_of(h, H + np.diag(precision))
+            h.log_likelihood, h.covariance = log_likelihood(h.data, h.residual, h.force_spread)
+            current = h.log_likelihood + penalty(h, names)
+            W = whitened_jacobian(h, slopes)
+            H = W @ W.T
         g = W @ whiten(h.data, h.covariance, h.residual) + pull
         better = None
         for _ in range(5):
             A = H + np.diag(precision + damping * np.diag(H) + 1e-12)
             new = h.copy()
-            new.values[at] = _within(A, g, h.values[at], low, high)
+            x = _within(A, g, np.concatenate([h.values[at], h.force_coefficients]), low, high)
+            new.values[at], new.force_coefficients = x[: len(at)], x[len(at) :]
             new["T_L"] = min(max(new["T_L"], 0.4 * h["T_L"]), 2.5 * h["T_L"])
             new.evaluate()
             value = new.log_likelihood + penalty(new, names)
@@ -130,6 +195,7 @@ def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05, names: Sequ
             break
         gain, current = value - current, value
         h.values, h.predicted, h.residual = better.values, better.predicted, better.residual
+        h.force_coefficients = better.force_coefficients
         h.covariance, h.log_likelihood = better.covariance, better.log_likelihood
         damping = max(damping / 10, 1e-5)
         if gain < tolerance:

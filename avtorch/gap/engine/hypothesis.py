@@ -13,6 +13,7 @@ from avtorch.gap.engine.car import simulator_signals
 from avtorch.gap.engine.compiled_plant import read_late, simulate
 from avtorch.gap.engine.coordinates import COORDINATES, EFFECTS, FROM_THE_START, INDEX, base_name, neutral_values
 from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.force_map import ForceMap, MapForm
 from avtorch.gap.engine.likelihood import log_likelihood
 from avtorch.gap.engine.shape_error import ShapeLikelihood
 from avtorch.gap.simulator.plant import GapPlant
@@ -35,10 +36,14 @@ class Hypothesis:
     `neutral` (parameter,): the user's baseline, GLVD where it has no effects. `shift_speeds` (gear,) [m/s], rising.
     `lost`: stretches of rows (from, to) whose commands did not arrive. `alone`: delays of the recorder may be negative,
     as nothing tells them from the car's. `base`: the fitted hypothesis without effects that gains count from.
-    `baseline`: the user's plant, where the compiled one does not have all of its effects.
+    `baseline`: the user's plant, where the compiled one does not have all of its effects. `force`: the car's force
+    beyond K u as an unnamed part of the base, at `force_coefficients` (curve,); `plain`, of a base with a force: the
+    one without it, over which its gain counts.
 
     `evaluate` sets `predicted` and `residual` (channel, frame, bin), `log_likelihood` [nats] with the noise integrated
-    out, and the noise's `covariance` (band, channel, channel) at its maximum. `evidence.evaluate_evidence` sets the
+    out, and the noise's `covariance` (band, channel, channel) at its maximum. A fit sets `force_columns`, derivatives
+    by the map's coefficients and where they are from, and `force_spread` (band, channel, channel), what these
+    coefficients may still be wrong by. `evidence.evaluate_evidence` sets the
     rest.
     """
 
@@ -52,6 +57,9 @@ class Hypothesis:
     alone: bool = False
     base: Hypothesis | None = None
     baseline: GapPlant | None = None
+    force: MapForm | None = None
+    force_coefficients: FloatArray = field(default_factory=lambda: np.zeros(0))
+    plain: Hypothesis | None = field(default=None, repr=False)
 
     predicted: FloatArray = field(init=False, repr=False)
     residual: FloatArray = field(init=False, repr=False)
@@ -61,6 +69,8 @@ class Hypothesis:
     claimed: float = field(init=False, default=-np.inf)
     jacobian: FloatArray = field(init=False, repr=False)
     information: FloatArray = field(init=False, repr=False)
+    force_columns: tuple[FloatArray, FloatArray] | None = field(init=False, default=None, repr=False)
+    force_spread: FloatArray | None = field(init=False, default=None, repr=False)
     effect_energy: FloatArray | None = field(init=False, default=None, repr=False)
     shape: ShapeLikelihood | None = field(init=False, default=None, repr=False)
     shape_log: FloatArray = field(init=False, repr=False)
@@ -111,8 +121,11 @@ class Hypothesis:
             alone=self.alone,
             base=self.base,
             baseline=self.baseline,
+            force=self.force,
+            force_coefficients=self.force_coefficients.copy(),
+            plain=self.plain,
         )
-        for name in ("predicted", "residual", "covariance", "log_likelihood"):
+        for name in ("predicted", "residual", "covariance", "log_likelihood", "force_columns", "force_spread"):
             if hasattr(self, name):
                 setattr(other, name, getattr(self, name))
         return other
@@ -155,14 +168,26 @@ class Hypothesis:
         return tuple(dict.fromkeys(base_name(e) for e in self.effects))
 
     # prediction -------------------------------------------------------------------------------------------------------
-    def command(self) -> FloatArray:
-        """Commands (row,) [m/s²] as they arrived: lost ones are replaced by the last one before."""
-        if not self.lost:
-            return self.data.command
-        out = self.data.command.copy()
-        for i, j in self.lost:
-            out[i:j] = self.data.command[max(i - 1, 0)]
-        return out
+    @property
+    def force_map(self) -> ForceMap | None:
+        """The car's force beyond K u, where it has one."""
+        return None if self.force is None else self.force.force_map(self.force_coefficients)
+
+    def command(self, values: FloatArray | None = None) -> FloatArray:
+        """Commands (row,) [m/s²] as they arrived: lost ones are replaced by the last one before. With a force map, what
+        a car of gain K would need to do the same: F(u, v) / K, K being that of `values` (parameter,) where given."""
+        out = self.data.command
+        if self.lost:
+            out = out.copy()
+            for i, j in self.lost:
+                out[i:j] = self.data.command[max(i - 1, 0)]
+        if self.force is None:
+            return out
+        if self.lost:
+            more = self.force.force_map(self.force_coefficients)(out, self.data.smooth_speed)
+        else:
+            more = self.force_coefficients @ self.force.demands
+        return out + more / (self.values if values is None else values)[INDEX["K_L"]]
 
     def on_grid(
         self, values: FloatArray | None = None, onsets: FloatArray | None = None
@@ -177,7 +202,7 @@ class Hypothesis:
             p,
             self.onset_vector() if onsets is None else onsets,
             grid.time,
-            self.command()[grid.row],
+            self.command(p)[grid.row],
             grid.speed,
             grid.starts,
             grid.accel0,
@@ -224,5 +249,5 @@ class Hypothesis:
         """Predict and compare."""
         self.predicted = self.response()
         self.residual = self.data.measured - self.predicted
-        self.log_likelihood, self.covariance = log_likelihood(self.data, self.residual)
+        self.log_likelihood, self.covariance = log_likelihood(self.data, self.residual, self.force_spread)
         return self

@@ -23,7 +23,7 @@ from scipy.special import ndtr, ndtri
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.density import log_prior, support
-from avtorch.gap.engine.gauss_newton import jacobian, prior_terms, whitened_jacobian
+from avtorch.gap.engine.gauss_newton import force_columns, jacobian, prior_terms, whitened_jacobian
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import TEMPER
@@ -52,6 +52,10 @@ class Laplace:
         names = moving(h) if names is None else list(names)
         data = h.data
         W = whitened_jacobian(h, jacobian(h, names))
+        if h.force is not None:  # what a force map can do as well tells nothing: its coefficients are integrated out
+            X = whitened_jacobian(h, force_columns(h))
+            own: FloatArray = X @ X.T + np.eye(len(X)) / (temper * h.force.size**2)
+            W = W - (W @ X.T) @ np.linalg.solve(own, X)
         A: FloatArray = temper * W @ W.T + np.diag(prior_terms(h, names)[0])
         root = _root(np.asarray(np.linalg.inv(A), np.float64))
         residual = whiten(data, h.covariance, h.residual)

@@ -34,12 +34,24 @@ def band_covariance(data: DriveData, residual: FloatArray) -> FloatArray:
     return out / data.band_size[:, None, None]
 
 
-def log_likelihood(data: DriveData, residual: FloatArray) -> tuple[float, FloatArray]:
-    """Nats of the whole band, and the noise's covariance (band, channel, channel) at its maximum."""
+def log_likelihood(data: DriveData, residual: FloatArray, spread: FloatArray | None = None) -> tuple[float, FloatArray]:
+    """Nats of the whole band, and the noise's covariance (band, channel, channel) at its maximum.
+
+    `spread` (band, channel, channel): mean square of what coefficients that are integrated out may still be wrong by in
+    the residual; restricted maximum likelihood (Harville 1977) adds it to the noise, so that many coefficients cannot
+    fit a band of few to nothing.
+    """
     S = band_covariance(data, residual)
+    S = S if spread is None else S + spread
     trace = np.trace(S, axis1=1, axis2=2)
     S = S + _LEAST * trace[:, None, None] * np.eye(data.channel_count)
     return float(-0.5 * (data.band_size * np.linalg.slogdet(S)[1]).sum()), S
+
+
+def freedom(data: DriveData, covariance: FloatArray, spread: FloatArray) -> float:
+    """Effective number of the coefficients that leave a `spread` under the noise's covariance: what a likelihood at its
+    maximum is short of the integral over them, twice, in nats."""
+    return float((data.band_size * np.einsum("bij,bji->b", np.linalg.inv(covariance), spread)).sum())
 
 
 def claimed(data: DriveData, covariance: FloatArray, fmax: float = CLAIM_HZ) -> float:

@@ -24,6 +24,8 @@ OUTLIER_NATS = 18.0
 TRIED_NATS = 3.2
 """What one more effect must gain for the search to go on from there [nats]: odds of one in 25. Lower than
 `EFFECT_NATS`, so that the average sees what is around its best sets."""
+WITHIN_NATS = 25.0
+"""What is this far behind the best set is not examined [nats]: odds of one in 500 after tempering."""
 SHIFT_NATS = 3.0
 """A speed at which gears shift [nats]: one of some twenty places along the range of speeds."""
 ONSET_ODDS = 1 / 3
@@ -42,6 +44,13 @@ SCALE_OF_RANGE = 0.6
 FAINT_OF_RANGE = 0.3
 """Size below which an effect has no name, over the near end of its typical range [-] (a third of the far end where it
 has a sign): the prior vanishes there as exp(-(faint / size)²), a non-local prior (Johnson and Rossell 2010)."""
+
+MAP_SIZE = (0.2, 1.2)
+"""Relative size of a car's force beyond K u over the demanded acceleration [-], log-normal by mean and standard
+deviation of the logarithm: pedal maps, brakes and tyres bend by a tenth to a half of what is asked for."""
+FAINT_MAP = 0.05
+"""Relative size [-] at which a force map is none: the prior vanishes there as exp(-(faint / size)²), as that of a named
+effect does; a car with a true command is linear to some per cent."""
 
 RECORDER_DELAY_S = {"accel": (0.0, 0.0075), "speed": (0.01, 0.01)}
 """Mean and standard deviation of a recorder's delay [s]: buses, clocks of channels (REALITY: up to 20 ms)."""

@@ -17,11 +17,13 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, EngineEffect, base_name
 from avtorch.gap.engine.evidence import evaluate_evidence
-from avtorch.gap.engine.gauss_newton import fit, jacobian, objective, prior_terms, whitened_jacobian
+from avtorch.gap.engine.force_base import prices, with_force_map
+from avtorch.gap.engine.gauss_newton import fit, linearised, objective, whitened_jacobian
 from avtorch.gap.engine.gear_shifts import refined_shift_speeds, shift_speeds, upshift_rows
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import log_likelihood, whiten
 from avtorch.gap.engine.lost_messages import with_lost_messages
+from avtorch.gap.engine.priors import WITHIN_NATS
 from avtorch.gap.engine.recorder import traded
 
 _MOST_FITS, _FEWEST_FITS = 160, 40  # of a search; a hard case of five minutes takes about fifty
@@ -50,8 +52,8 @@ class Search:
     `ONE_CHANNEL_HZ`: the car's own unnamed dynamics then belong to the base.
 
     `most_fits` bounds what it may cost (0: by the length of the drive), `stop()` ends it where it returns True;
-    `complete` tells whether one of them did. `visited` maps a set (names, and whether each has an onset) to its
-    best hypothesis.
+    `complete` tells whether one of them did. `visited` maps a set (names, and whether each has an onset; the name of its
+    force map) to its best hypothesis. `map_bases`: bases with a force map that sets have grown from.
     """
 
     base: Hypothesis
@@ -64,6 +66,7 @@ class Search:
     visited: dict[tuple[tuple[str, bool], ...], Hypothesis] = field(default_factory=dict)
     fits: int = 0
     complete: bool = True
+    map_bases: list[Hypothesis] = field(default_factory=list)
     _shifts_refined: bool = False
 
     def __post_init__(self) -> None:
@@ -88,7 +91,31 @@ class Search:
                 best = best.copy()
                 best.shift_speeds = speeds
                 best = self.extended(self._put(best.evaluate(), anew=True), another_way=False)
+        return self._in_front_of_a_map(best)
+
+    def _in_front_of_a_map(self, best: Hypothesis) -> Hypothesis:
+        """The best set where the car's force may be any map: sets grow from each base with a map that could win.
+
+        A map competes with the names that were found without it. Where it is far behind them, nothing changes.
+        """
+        priced = [] if self._ended() else prices(best)
+        least = max([0.0, *(p.nats for p in priced)]) - WITHIN_NATS
+        bases = [with_force_map(self.base, p.form) for p in priced if p.nats > least]
+        for base in bases:
+            self._put(base)
+            self.fits = 0
+            found = self._with_map_of(best, base)
+            best = max(best, self.extended(found, another_way=False), key=lambda h: h.score)
+        self.map_bases = bases
         return best
+
+    def _with_map_of(self, h: Hypothesis, base: Hypothesis) -> Hypothesis:
+        """The best set in front of a base's map that has none but the effects of `h`: a map takes some of them up."""
+        now = h.copy()
+        now.base, now.plain, now.force, now.force_coefficients = base, base.plain, base.force, base.force_coefficients
+        if h.force is not None or set(h.effects) <= set(base.effects):
+            return base
+        return max(base, self._pruned(self._put(fit(now, 10)), last=True), key=lambda h: h.score)
 
     def extended(self, start: Hypothesis, another_way: bool = True) -> Hypothesis:
         """The best set that grows from `start`, by one more effect at a time."""
@@ -109,12 +136,13 @@ class Search:
                 best = max(best, self._climbed(h), key=lambda h: h.score)
         return best
 
-    def key(self, h: Hypothesis) -> tuple[tuple[str, bool], ...]:
-        return tuple(sorted((base_name(e), e in h.onsets) for e in h.effects))
+    def key(self, h: Hypothesis, without: str | None = None) -> tuple[tuple[str, bool], ...]:
+        own = [(base_name(e), e in h.onsets) for e in h.effects if e != without]
+        return tuple(sorted(own if h.force is None else [*own, (h.force.name, False)]))
 
     def without(self, h: Hypothesis, effect: str) -> Hypothesis | None:
         """The visited hypothesis with the other effects, if there is one."""
-        return self.visited.get(tuple(sorted((base_name(e), e in h.onsets) for e in h.effects if e != effect)))
+        return self.visited.get(self.key(h, without=effect))
 
     # steps -------------------------------------------------------------------------------------------------------
     def _ended(self) -> bool:
@@ -225,11 +253,11 @@ class Search:
             h = self._pruned(new)
         return h
 
-    def _pruned(self, h: Hypothesis) -> Hypothesis:
-        """The best after leaving out each effect but the last in turn, and each onset."""
+    def _pruned(self, h: Hypothesis, last: bool = False) -> Hypothesis:
+        """The best after leaving out each effect but the last (that too where `last`) in turn, and each onset."""
         while h.effects and not self._ended():
             others = []
-            for e in h.effects[:-1]:
+            for e in h.effects if last else h.effects[:-1]:
                 if e == "~linear" and self.alone:
                     continue
                 self.fits += 1
@@ -266,16 +294,19 @@ class _Projection:
 
     def __init__(self, h: Hypothesis) -> None:
         names = h.free
-        W = whitened_jacobian(h, jacobian(h, names))
-        precision, pull = prior_terms(h, names)
-        self.rows = len(names)
+        slopes, precision, pull = linearised(h, names)
+        W = whitened_jacobian(h, slopes)
+        self.rows = len(W)
         A = np.hstack([W, np.diag(np.sqrt(precision))])
         r = np.concatenate([whiten(h.data, h.covariance, h.residual), pull / np.sqrt(np.maximum(precision, 1e-30))])
         size = np.linalg.norm(A, axis=1)
         self._basis = np.linalg.qr((A[size > 1e-9] / size[size > 1e-9, None]).T)[0]
         self.residual = r - self._basis @ (self._basis.T @ r)
 
-        self._data = h.data
+        self._data, self._spread = h.data, None
+        if h.force_spread is not None:
+            inverse = np.linalg.inv(np.linalg.cholesky(h.covariance))
+            self._spread = inverse @ h.force_spread @ np.swapaxes(inverse, 1, 2)
         self._start = self._nats(self.residual)
 
     def __call__(self, whitened: FloatArray) -> FloatArray:
@@ -292,7 +323,8 @@ class _Projection:
     def _nats(self, x: FloatArray) -> float:
         data = self._data
         shape = data.channel_count, data.frame_count, data.bin_count
-        return log_likelihood(data, x[: -self.rows].reshape(shape))[0] - 0.5 * float(x[-self.rows :] @ x[-self.rows :])
+        nats = log_likelihood(data, x[: -self.rows].reshape(shape), self._spread)[0]
+        return nats - 0.5 * float(x[-self.rows :] @ x[-self.rows :])
 
 
 def promises(h: Hypothesis, candidates: Sequence[EngineEffect]) -> list[Promise]:

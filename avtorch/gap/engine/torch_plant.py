@@ -55,6 +55,8 @@ def own_value(c: Coordinate, z: Tensor) -> Tensor:
 
 def not_in_torch(h: Hypothesis) -> str:
     """Why there is no such plant of a hypothesis; empty where there is one."""
+    if h.force is not None:
+        return "its force is a map, whose coefficients would be draws, too"
     late = [e for e in h.onsets if e != "gain_change"]
     if late and _by_the_simulator(h):
         return f"{' and '.join(late)} set in beside what the simulator alone has"

@@ -1,0 +1,81 @@
+"""Bases with a force map: what a map would gain beside a hypothesis, and the map fitted into the command.
+
+Three bases compete in the same evidence: K u, K u with a resistance R(v), and any F(u, v). The price of a map is linear,
+one Gram matrix for all sizes. A base is its fit: lag, gain, recorder and map together, the prior size of the map chosen
+anew from round to round, and all sizes summed in the evidence.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from avtorch.arrays import FloatArray
+from avtorch.gap.engine.evidence import evaluate_evidence
+from avtorch.gap.engine.force_map import MAP_SIZES, MapForm, map_forms, size_log_prior
+from avtorch.gap.engine.free_forms import band_products, block, linear_evidence, map_free_form
+from avtorch.gap.engine.gauss_newton import fit, linearised, objective
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.likelihood import log_sum
+from avtorch.gap.engine.priors import UNKNOWN_NATS
+
+_ROUNDS = 3  # of fits, each with the likeliest size of the map
+_LAGS_S = (None, 0.3)  # from which a fit begins: the base's own lag was fitted to a wrong force
+
+
+class Price(NamedTuple):
+    """What a form would gain beside a hypothesis [nats], its presence paid for, and its likeliest prior size [-]."""
+
+    form: MapForm
+    nats: float
+
+
+def prices(h: Hypothesis) -> list[Price]:
+    """Gains of the forms of a map beside a hypothesis with its evidence, by one linear step; none where it has one."""
+    if h.force is not None:
+        return []
+    out = []
+    for form in map_forms(h.data):
+        found = block(h, map_free_form(h, form))
+        out.append(Price(form.of_size(found.size), found.nats - UNKNOWN_NATS))
+    return out
+
+
+def with_force_map(base: Hypothesis, form: MapForm) -> Hypothesis:
+    """A base with a force map, fitted and valued; gains count over `base`, which has none."""
+    best = None
+    for lag in _LAGS_S:
+        h = base.copy()
+        h.plain, h.force, h.force_coefficients = base, form, np.zeros(form.count)
+        if lag is not None:
+            h["T_L"] = lag
+        fit(h, 10)
+        if best is None or objective(h) > objective(best):
+            best = h
+    assert best is not None
+    h = best
+    for _ in range(_ROUNDS):
+        nats = _of_sizes(h)
+        k = int(np.argmax(nats))
+        settled = h.force is not None and MAP_SIZES[k] == h.force.size
+        h.force = form.of_size(float(MAP_SIZES[k]), log_sum(nats) - float(nats[k]))
+        if settled:
+            break
+        fit(h, 6)
+    h.base = h
+    return evaluate_evidence(h)
+
+
+def _of_sizes(h: Hypothesis) -> FloatArray:
+    """Log evidence and log prior (size,) [nats] of each of `MAP_SIZES`, of a map linear around where it is."""
+    assert h.force is not None
+    slopes, precision, pull = linearised(h, h.free)
+    products = band_products(h.data, np.concatenate([h.residual[None], slopes]))
+    b, n = h.force_coefficients, len(h.free)
+    nats = []
+    for size in MAP_SIZES:
+        precision[n:], pull[n:] = size**-2, -b / size**2
+        value, _ = linear_evidence(h, products, precision, pull, 4, integrated=len(b))
+        nats.append(value - 0.5 * float(b @ b) / size**2 - len(b) * np.log(size))
+    return np.array(nats) + size_log_prior()
