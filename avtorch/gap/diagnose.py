@@ -35,6 +35,7 @@ from avtorch.gap.result.held_out import held_out_errors, nested
 from avtorch.gap.result.hypotheses import best_weight, candidates_of, first_onset, verdict, verdict_names
 from avtorch.gap.result.own_random import own_random, renamed
 from avtorch.gap.result.parameters import ParameterPosterior, base_quantities
+from avtorch.gap.result.parts import force_map_of, parts_of, said_of_map
 from avtorch.gap.result.predictive_model import noise_of, predictive_models
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import uncounted
@@ -46,6 +47,8 @@ from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.whole_progress import WholeProgress
 from avtorch.io import Log, LogSource, as_logs
 from avtorch.io.mapping import Pairs
+
+_WITHOUT_MAP = "The repaired simulator has the named effects, not the force map; what is left is measured with it."
 
 
 @shows_progress
@@ -147,7 +150,8 @@ def diagnose(
     chosen = ParameterPosterior(weight, draws, seed, random)
     candidates, posteriors = candidates_of(average, each, kinds, chosen if named else None, random)
     # an unknown cause shows where the best known ones would act
-    top = weight if named or names == ("none",) else _likeliest(average)
+    mapped = weight.examined.hypothesis.force is not None
+    top = weight if named or mapped or names == ("none",) else _likeliest(average)
     best = top.examined.hypothesis
     if told is not None:
         told("held-out blocks", 0, 1)
@@ -173,6 +177,10 @@ def diagnose(
     said = verdict(average, names, known, partial=budget is not None and budget.partial)
     if not complete and "unknown" not in said.alias_set:  # which stands for what was not tried
         said = replace(said, alias_set=(*said.alias_set, "unknown"))
+    parts = parts_of(average, said.names, chosen, seed)
+    said = replace(said, why=" ".join(filter(None, (said.why, said_of_map(parts)))))
+    if named and force_map_of(parts) is not None:
+        notes[_WITHOUT_MAP] = None
     if told is not None:
         told("held-out blocks", 1, 1)
     hidden = note(data.channels, kinds)
@@ -217,6 +225,7 @@ def diagnose(
         scope=scope,
         notes=(*notes, *([hidden] if hidden else []), *sentences.untried(scope)),
         budget=budget,
+        parts=parts,
     )
 
 

@@ -103,7 +103,7 @@ class Search:
         bases = [with_force_map(self.base, p.form) for p in priced if p.nats > least]
         for base in bases:
             self._put(base)
-            self.fits = 0
+            self.fits = self.most_fits // 2  # sets in front of a map begin where those without one ended
             found = self._with_map_of(best, base)
             best = max(best, self.extended(found, another_way=False), key=lambda h: h.score)
         self.map_bases = bases

@@ -28,11 +28,13 @@ from avtorch.gap.answer.verdict import (
     plausibility,
     verdict_of,
 )
+from avtorch.gap.engine.force_map import ForceMap
 from avtorch.gap.quantity import Quantity, frame_of, unit_of
 from avtorch.gap.result import sentences
 from avtorch.gap.result.alarm import Alarm
 from avtorch.gap.result.gap_size import GapSize
 from avtorch.gap.result.log_facts import LogFacts
+from avtorch.gap.result.parts import AnswerPart, force_map_of
 from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
 from avtorch.gap.result.traces import Traces
@@ -87,6 +89,7 @@ class Diagnosis(Displayed):
     - `where`, `shrinkage`: where the gap lies, and how far it shrinks on held-out folds; empty where there is no gap,
       None where the drives are too short to split or nothing was named
     - `budget`: what each cause contributes to the gap; None where the drives are too short to hold out blocks
+    - `parts`: the named effects, and beside them the force map of the car, a part without a name; see `force_map`
     - `traces`: the drives beside the rollouts of `simulator` and `plant`
     - `contenders`: predictive models of the alias set, as far as it was fitted; where held-out blocks selected effects,
       of the repaired simulator and what could take its place
@@ -140,6 +143,7 @@ class Diagnosis(Displayed):
     budget: Budget | None = None
     tested: SimulatorUnderTest | None = None
     alarms: tuple[Alarm, ...] = ()
+    parts: tuple[AnswerPart, ...] = ()
 
     def __post_init__(self) -> None:
         if self.onset_s is not None and self.onset_from_start_s is None:
@@ -206,6 +210,11 @@ class Diagnosis(Displayed):
         return Frame.of_rows(rows).to_dataframe()
 
     @property
+    def force_map(self) -> ForceMap | None:
+        """The car's force beyond K u where it is likely, as a table; `plant` does not carry it."""
+        return force_map_of(self.parts)
+
+    @property
     def winner(self) -> Candidate:
         """The verdict's entry among the hypotheses; where it is too improbable to be listed, one without numbers."""
         name = self.verdict.name
@@ -219,7 +228,7 @@ class Diagnosis(Displayed):
     def to_dict(self) -> dict[str, Any]:
         """The object of `diagnosis.json`, schema `avtorch.diagnosis/2`, or `/1` where there is no budget.
 
-        Beyond the schema's keys it has `moved`, `onset_s`, `plausible` and `plausibility` of each effect, the last two
+        Beyond the schema's keys it has `parts` (name or null, family, form, size and probability), `moved`, `onset_s`, `plausible` and `plausibility` of each effect, the last two
         of the verdict, `onset_from_start_s`, `setting`, `remaining`, `complete`, `not_tried` (`effects` by name;
         `pairs`, of which "all", "some", "none" were tried, or "lost") and `notes`.
         """
@@ -233,6 +242,7 @@ class Diagnosis(Displayed):
             "onset_s": self.onset_s,
             "onset_from_start_s": self.onset_from_start_s,
             "effects": [c.to_dict() for c in self.candidates],
+            "parts": [part.to_dict() for part in self.parts],
             "verdict": self.verdict.to_dict() | plausibility(self.winner.implausible),
             "shrinkage": None if self.shrinkage is None else self.shrinkage.to_dict(),
             "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),

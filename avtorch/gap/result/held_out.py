@@ -24,7 +24,7 @@ from avtorch.arrays import BoolArray, FloatArray
 from avtorch.gap.answer.budget import HORIZON_S
 from avtorch.gap.engine.coordinates import INDEX, base_name
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.gauss_newton import fit, jacobian, penalty, prior_terms
+from avtorch.gap.engine.gauss_newton import fit, linear_priors, linearised, penalty
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance, whiten
 from avtorch.gap.result.black_box_rest import BlackBox
@@ -132,9 +132,10 @@ def nested(base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis] = (
     """A chain from `base` to `full`, one more effect at a time, those without which free runs are worst first.
 
     From `full` on the effect leaves that free runs miss least, all others refitted; fits among `visited` are taken as
-    they are. What chance decides enters with the first effect. Runs are those of the fit: the order is no score.
+    they are. What chance decides enters with the first effect. Runs are those of the fit: the order is no score. A
+    force map enters before all effects, which act in front of it.
     """
-    known = {_key(h): h for h in visited}
+    known = {_key(h): h for h in visited if (h.force and h.force.name) == (full.force and full.force.name)}
     floor = _run_squares(full)
     chain = [full]
     while len(_sized(chain[-1])) > 1:
@@ -142,11 +143,14 @@ def nested(base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis] = (
         rest = {e: known.get(_key(now, e)) or _refitted(now, e) for e in _sized(now)}
         cost = {e: float((_run_squares(h) / floor).mean()) for e, h in rest.items()}
         chain.append(rest[min(cost, key=lambda e: cost[e])])
-    return [base, *(reversed(chain) if _sized(full) else ())]
+    mapped = [full.base] if full.force is not None and full.base is not None else []
+    return [base, *mapped, *(reversed(chain) if _sized(full) else ())]
 
 
 def entered(before: Hypothesis, after: Hypothesis) -> str:
-    """The effect, by the table's name, that one hypothesis has and the one before it has not."""
+    """The effect, by the table's name, that one hypothesis has and the one before it has not; or "force map"."""
+    if before.force is None and after.force is not None:
+        return "force map"
     return next(base_name(e) for e in _sized(after) if e not in before.effects)
 
 
@@ -164,11 +168,11 @@ class _Taught:
 
 def _taught(h: Hypothesis, blocks: Blocks) -> _Taught:
     h = _without_chance(h)
-    slopes = jacobian(h, h.free)
+    slopes, *_ = linearised(h, h.free)
     values, residuals, errors = [], [], []
     for frames in blocks.taught:
-        fold = h.copy()
-        fold.values = _fold_fit(h, slopes, frames)
+        fold, taught = h.copy(), _fold_fit(h, slopes, frames)
+        fold.values, fold.force_coefficients = taught.values, taught.force_coefficients
         rows = readings(fold, *fold.on_grid())
         values.append(fold.values)
         residuals.append(h.data.measured - h.data.transform(compared(h.data, rows)))
@@ -176,8 +180,8 @@ def _taught(h: Hypothesis, blocks: Blocks) -> _Taught:
     return _Taught(h, np.array(values), np.array(residuals), np.array(errors))
 
 
-def _fold_fit(h: Hypothesis, slopes: FloatArray, frames: BoolArray) -> FloatArray:
-    """Values (parameter,) fitted to some `frames`, `slopes` (free, channel, frame, bin) being those of the whole fit.
+def _fold_fit(h: Hypothesis, slopes: FloatArray, frames: BoolArray) -> Hypothesis:
+    """Fitted to some `frames`, `slopes` (unknown, channel, frame, bin) being those of the whole fit.
 
     What stands at a limit stays there.
     """
@@ -186,25 +190,26 @@ def _fold_fit(h: Hypothesis, slopes: FloatArray, frames: BoolArray) -> FloatArra
     at = np.array([INDEX[n] for n in names])
     moves = (h.values[at] > low) & (h.values[at] < high)
     names, at, low, high = [n for n, m in zip(names, moves, strict=True) if m], at[moves], low[moves], high[moves]
-    slopes = slopes[moves][:, :, frames]
+    slopes = slopes[np.append(moves, np.ones(len(slopes) - len(moves), bool))][:, :, frames]
     now = h.on(h.data.only(frames))
     for _ in range(_STEPS):
         W = np.array([whiten(now.data, now.covariance, x) for x in slopes])
-        precision, pull = prior_terms(now, names)
+        precision, pull = linear_priors(now, names)
         step = np.linalg.solve(
             W @ W.T + np.diag(precision + 1e-12), W @ whiten(now.data, now.covariance, now.residual) + pull
         )
         value = now.log_likelihood + penalty(now, names)
         for share in _DAMPED:
             new = now.copy()
-            new.values[at] = np.clip(now.values[at] + share * step, low, high)
+            new.values[at] = np.clip(now.values[at] + share * step[: len(at)], low, high)
+            new.force_coefficients = now.force_coefficients + share * step[len(at) :]
             new.evaluate()
             if new.log_likelihood + penalty(new, names) > value:
                 now = new
                 break
         else:
             break
-    return now.values
+    return now
 
 
 def _without_chance(h: Hypothesis) -> Hypothesis:
