@@ -14,7 +14,7 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.effects import Gust, Outliers, RoadGrade
 from avtorch.gap.engine.average import Weight
 from avtorch.gap.engine.car import effect_values, plant_of
-from avtorch.gap.engine.coordinates import EFFECTS, base_name
+from avtorch.gap.engine.coordinates import EFFECTS, Coordinate, base_name
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.sample import Draws, sample
@@ -26,6 +26,7 @@ from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io.units import GRAVITY
 
 _DRAWS = 1000
+_FARTHEST = 12.0  # m/s² or m/s³: no car's limit
 _GRID_STEP = 0.07  # standard deviation of the logarithm of what is read from a grid of sizes
 
 
@@ -118,7 +119,7 @@ class ParameterPosterior:
         kind = EFFECTS[e].kind or TABLE[base_name(e)]
         given = effect_values(self.hypothesis, e)
         for c in EFFECTS[e].coordinates:
-            given[c.parameter] = torch.as_tensor([c.value(x) for x in self._column(c.name).tolist()])
+            given[c.parameter] = torch.as_tensor([_within_reach(c, x) for x in self._column(c.name).tolist()])
         if e == "command_hold":
             rows = len(self.hypothesis.data.time)
             p, n = given["hold_fraction"], len(self.hypothesis.lost)
@@ -173,6 +174,12 @@ class ParameterPosterior:
             else:
                 out.append(kinds[name](**own).in_noise(noise))
         return out
+
+
+def _within_reach(c: Coordinate, z: float) -> float:
+    """The parameter at coordinate `z`; a limit that no command of the drive comes near is told as far out as may be."""
+    value = c.value(z)
+    return value if math.isfinite(value) else math.copysign(_FARTHEST, value)
 
 
 def table_quantities(h: Hypothesis, effect: str, seed: int = 0) -> dict[str, Quantity]:
