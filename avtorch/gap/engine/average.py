@@ -189,7 +189,7 @@ def average(
         allowed = None if effects is None else {*effects, "none", "unknown"}
         # what chance decides and nobody asked for is noise
         nameless = set() if effects is None else {*SLOW, "outliers"} - {*effects}
-        weights = [replace(w, label=_without(w.label, nameless)) for w in weights]
+        weights = [replace(w, label=_renamed(w, nameless)) for w in weights]
         weights = [
             w
             for w in weights
@@ -220,8 +220,10 @@ def average(
 
 
 # inside ---------------------------------------------------------------------------------------------------------------
-def _without(label: str, names: Collection[str]) -> str:
-    return "+".join(n for n in label.split("+") if n not in names) or "none"
+def _renamed(w: Weight, nameless: Collection[str]) -> str:
+    """The weight's label without names; with a force map, what has no other name is unknown."""
+    left = "+".join(n for n in w.label.split("+") if n not in nameless)
+    return left or ("none" if w.examined.hypothesis.force is None else "unknown")
 
 
 def _given(label: str, prior: Mapping[str, float]) -> float:

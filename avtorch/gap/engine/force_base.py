@@ -30,6 +30,11 @@ class Price(NamedTuple):
     form: MapForm
     nats: float
 
+    @property
+    def gains(self) -> bool:
+        """Whether the drive speaks for it at all: the odds against any map are left out."""
+        return self.nats > -UNKNOWN_NATS
+
 
 def prices(h: Hypothesis) -> list[Price]:
     """Gains of the forms of a map beside a hypothesis with its evidence, by one linear step; none where it has one."""

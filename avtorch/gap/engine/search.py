@@ -96,11 +96,17 @@ class Search:
     def _in_front_of_a_map(self, best: Hypothesis) -> Hypothesis:
         """The best set where the car's force may be any map: sets grow from each base with a map that could win.
 
-        A map competes with the names that were found without it. Where it is far behind them, nothing changes.
+        A map competes with the names that were found without it: it has to gain something, beside these or by itself,
+        and not be far behind them. Where it does not, nothing changes.
         """
-        priced = [] if self._ended() else prices(best)
-        least = max([0.0, *(p.nats for p in priced)]) - WITHIN_NATS
-        bases = [with_force_map(self.base, p.form) for p in priced if p.nats > least]
+        if self._ended():
+            return best
+        more = best.score - self.base.score
+        alone, beside = prices(self.base), prices(best) if more > 0 else []
+        wanted = {p.form.name: p.nats for p in beside if p.gains}
+        wanted |= {p.form.name: p.nats - more for p in alone if p.gains and p.form.name not in wanted}
+        least = max([0.0, *wanted.values()]) - WITHIN_NATS
+        bases = [with_force_map(self.base, p.form) for p in alone if wanted.get(p.form.name, -np.inf) > least]
         for base in bases:
             self._put(base)
             self.fits = self.most_fits // 2  # sets in front of a map begin where those without one ended
