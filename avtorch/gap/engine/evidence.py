@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from avtorch.gap.engine.coordinates import COORDINATES, EFFECTS, INDEX
-from avtorch.gap.engine.gauss_newton import linearised, normal_prior, whitened_jacobian
+from avtorch.gap.engine.gauss_newton import linearised, normal_prior, whitened_under_noise
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import claimed, freedom, log_sum
 from avtorch.gap.engine.priors import LOST_NATS, ONSET_ODDS, SHIFT_NATS, TRIED_NATS
@@ -23,6 +23,7 @@ from avtorch.gap.engine.shape_error import effect_energy, log_prior, shape_likel
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 _STUDENT_3 = math.log(2 / (math.pi * math.sqrt(3)))  # log density at the centre, scale 1
 _IMPOSSIBLE = -60.0  # nats: an effect of no size; finite, so that sets compare
+_ROUNDS = 4  # until the noise beside a force map has settled within a tenth of a nat
 _BASE_SD = {"T_L": 0.7, "K_L": 0.3}  # of log T_L; scale of K_L, as `simulator.plant.BASELINE` has them
 
 
@@ -50,7 +51,7 @@ def evaluate_evidence(h: Hypothesis) -> Hypothesis:
     base = h.base or h
     names = h.free
     h.jacobian, precision, _ = linearised(h, names)
-    W = whitened_jacobian(h, h.jacobian)
+    W = whitened_under_noise(h, h.jacobian, precision, _ROUNDS)
     h.information = W @ W.T + np.diag(precision)
     h.claimed = claimed(h.data, h.covariance)
     first = base.plain or base

@@ -59,17 +59,28 @@ def with_force_map(base: Hypothesis, form: MapForm) -> Hypothesis:
         if best is None or objective(h) > objective(best):
             best = h
     assert best is not None
-    h = best
     for _ in range(_ROUNDS):
-        nats = _of_sizes(h)
-        k = int(np.argmax(nats))
-        settled = h.force is not None and MAP_SIZES[k] == h.force.size
-        h.force = form.of_size(float(MAP_SIZES[k]), log_sum(nats) - float(nats[k]))
-        if settled:
+        before = best.force
+        best = resized(best)
+        if before is not None and best.force is not None and before.size == best.force.size:
             break
-        fit(h, 6)
-    h.base = h
-    return evaluate_evidence(h)
+    best.base = best
+    return evaluate_evidence(best)
+
+
+def resized(h: Hypothesis) -> Hypothesis:
+    """The fitted hypothesis with the likeliest prior size of its map, changed in place: effects that do what the map
+    did leave a smaller one. One without a map stays as it is."""
+    if h.force is None:
+        return h
+    for _ in range(2):
+        nats, size = _of_sizes(h), h.force.size
+        k = int(np.argmax(nats))
+        h.force = h.force.of_size(float(MAP_SIZES[k]), log_sum(nats) - float(nats[k]))
+        if h.force.size == size:
+            break
+        fit(h, 5, 0.1)
+    return h
 
 
 def _of_sizes(h: Hypothesis) -> FloatArray:
@@ -81,6 +92,6 @@ def _of_sizes(h: Hypothesis) -> FloatArray:
     nats = []
     for size in MAP_SIZES:
         precision[n:], pull[n:] = size**-2, -b / size**2
-        value, _ = linear_evidence(h, products, precision, pull, 4, integrated=len(b))
+        value, _ = linear_evidence(h, products, precision, pull, 8, integrated=True)
         nats.append(value - 0.5 * float(b @ b) / size**2 - len(b) * np.log(size))
     return np.array(nats) + size_log_prior()

@@ -59,7 +59,8 @@ class FreeForm:
     """A linear family: `columns` (column, channel, frame, bin) are the responses to its demands of coefficient one.
 
     `family`: where it acts ("force map", "dynamics", "time", "recorder"); `terms` (column,): each demand in words.
-    `sizes`: prior standard deviations of a coefficient, each with its log prior probability.
+    `sizes`: prior standard deviations of a coefficient, each with its log prior probability; several where there are
+    more coefficients than any drive tells.
     """
 
     name: str
@@ -137,10 +138,12 @@ def block(h: Hypothesis, form: FreeForm, iterations: int = 4) -> FreeFormFit:
     count = len(form.columns)
     pull = np.concatenate([pull, np.zeros(count)])
     nats: list[float] = []
+    many = len(form.sizes) > 1
+    rounds = 2 * iterations if many else iterations
     best, size = np.zeros(known + count), form.sizes[0][0]
     for sd, log_prior in form.sizes:
         tight = np.concatenate([precision, np.full(count, sd**-2)])
-        value, moves = linear_evidence(h, products, tight, pull, iterations, count if form.family == "force map" else 0)
+        value, moves = linear_evidence(h, products, tight, pull, rounds, integrated=many)
         nats.append(value - count * math.log(sd) + log_prior - without)
         if nats[-1] == max(nats):
             best, size = moves, sd
@@ -246,13 +249,14 @@ def linear_evidence(
     precision: FloatArray,
     pull: FloatArray,
     iterations: int,
-    integrated: int = 0,
+    *,
+    integrated: bool = False,
 ) -> tuple[float, FloatArray]:
     """Gain [nats] of signals 1, 2, ... of `products` in explaining signal 0, and their coefficients.
 
     Coefficients have the prior exp(pull' b - b' diag(precision) b / 2), whose own normalisation is left out. The gain
-    contains that of the likelihood over `h`, the prior's change, and -1/2 log det of the posterior's precision. The
-    last `integrated` coefficients are so many that the noise needs what they may be wrong by (`log_likelihood`).
+    contains that of the likelihood over `h`, the prior's change, and -1/2 log det of the posterior's precision.
+    `integrated`: there are so many that the noise needs what they may be wrong by (`log_likelihood`).
     """
     data, noise = h.data, h.covariance
     before = claimed(data, noise), h.log_likelihood
@@ -269,13 +273,13 @@ def linear_evidence(
         left = np.concatenate([[1.0], -moves])
         noise = (products @ left) @ left / data.band_size[:, None, None]
         if integrated:
-            unsure = cho_solve(factor, np.eye(len(precision)))[-integrated:, -integrated:]
-            spread = np.tensordot(products[..., -integrated:, -integrated:], unsure, 2) / data.band_size[:, None, None]
+            unsure = cho_solve(factor, np.eye(len(precision)))
+            spread = np.tensordot(products[..., 1:, 1:], unsure, 2) / data.band_size[:, None, None]
         noise += spread + _LEAST * np.trace(noise, axis1=1, axis2=2)[:, None, None] * np.eye(data.channel_count)
         gain = min(claimed(data, noise) - before[0], claimed(data, noise, math.inf) - before[1])
         gain += 0.5 * freedom(data, noise, spread) if integrated else 0.0
         gain += float(pull @ moves - 0.5 * precision @ moves**2) - float(np.log(np.diag(factor[0])).sum())
-        if gain > best:
+        if gain > best or integrated:  # the noise has to settle first
             best, at = gain, moves
     return best, at
 

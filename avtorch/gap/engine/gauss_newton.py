@@ -138,15 +138,23 @@ def force_columns(h: Hypothesis) -> FloatArray:
     return columns
 
 
-def spread_of(h: Hypothesis, information: FloatArray) -> FloatArray | None:
-    """Mean square (band, channel, channel) in the response of what the coefficients of the force map may be wrong by;
-    `information` (unknown, unknown): of all unknowns, the coefficients last. None without a map."""
+def whitened_under_noise(h: Hypothesis, slopes: FloatArray, precision: FloatArray, rounds: int) -> FloatArray:
+    """Derivatives in units of the noise, (unknown, coefficient), of `linearised`.
+
+    With a force map the noise has what the response may be wrong by, all unknowns together, and this depends on the
+    noise: in so many rounds both settle, and the hypothesis has the noise and its log likelihood.
+    """
+    W = whitened_jacobian(h, slopes)
     if h.force is None:
-        return None
-    covariance = np.linalg.inv(information)[-h.force.count :, -h.force.count :]
-    sizes, turn = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    columns = np.tensordot((turn * np.sqrt(np.maximum(sizes, 0.0))).T, force_columns(h), 1)
-    return np.sum([band_covariance(h.data, column) for column in columns], axis=0)
+        return W
+    for _ in range(rounds):
+        unsure = np.linalg.inv(W @ W.T + np.diag(precision))
+        sizes, turn = np.linalg.eigh(0.5 * (unsure + unsure.T))
+        turned = np.tensordot((turn * np.sqrt(np.maximum(sizes, 0.0))).T, slopes, 1)
+        h.force_spread = np.sum([band_covariance(h.data, x) for x in turned], axis=0)
+        h.log_likelihood, h.covariance = log_likelihood(h.data, h.residual, h.force_spread)
+        W = whitened_jacobian(h, slopes)
+    return W
 
 
 def whitened_jacobian(h: Hypothesis, derivatives: FloatArray) -> FloatArray:
@@ -169,14 +177,9 @@ def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05, names: Sequ
     current, damping = h.log_likelihood + penalty(h, names), 1e-3
     for _ in range(iterations):
         slopes, precision, pull = linearised(h, names)
-        W = whitened_jacobian(h, slopes)
+        W = whitened_under_noise(h, slopes, precision, 1)
         H = W @ W.T
-        if h.force is not None:
-            h.force_spread = spread_of(h, H + np.diag(precision))
-            h.log_likelihood, h.covariance = log_likelihood(h.data, h.residual, h.force_spread)
-            current = h.log_likelihood + penalty(h, names)
-            W = whitened_jacobian(h, slopes)
-            H = W @ W.T
+        current = h.log_likelihood + penalty(h, names)
         g = W @ whiten(h.data, h.covariance, h.residual) + pull
         better = None
         for _ in range(5):

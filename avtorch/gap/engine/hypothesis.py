@@ -42,8 +42,8 @@ class Hypothesis:
 
     `evaluate` sets `predicted` and `residual` (channel, frame, bin), `log_likelihood` [nats] with the noise integrated
     out, and the noise's `covariance` (band, channel, channel) at its maximum. A fit sets `force_columns`, derivatives
-    by the map's coefficients and where they are from, and `force_spread` (band, channel, channel), what these
-    coefficients may still be wrong by. `evidence.evaluate_evidence` sets the
+    by the map's coefficients and where they are from, and beside a map `force_spread` (band, channel, channel), what
+    the response may still be wrong by. `evidence.evaluate_evidence` sets the
     rest.
     """
 

@@ -17,7 +17,7 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, EngineEffect, base_name
 from avtorch.gap.engine.evidence import evaluate_evidence
-from avtorch.gap.engine.force_base import prices, with_force_map
+from avtorch.gap.engine.force_base import prices, resized, with_force_map
 from avtorch.gap.engine.gauss_newton import fit, linearised, objective, whitened_jacobian
 from avtorch.gap.engine.gear_shifts import refined_shift_speeds, shift_speeds, upshift_rows
 from avtorch.gap.engine.hypothesis import Hypothesis
@@ -99,7 +99,7 @@ class Search:
         A map competes with the names that were found without it: it has to gain something, beside these or by itself,
         and not be far behind them. Where it does not, nothing changes.
         """
-        if self._ended():
+        if self._ended() or self.base.data.channel_count == 1:  # there a map and the base's own dynamics are alike
             return best
         more = best.score - self.base.score
         alone, beside = prices(self.base), prices(best) if more > 0 else []
@@ -162,7 +162,7 @@ class Search:
         return sum(e != "~linear" for e in h.effects)
 
     def _put(self, h: Hypothesis, anew: bool = False) -> Hypothesis:
-        evaluate_evidence(h)
+        evaluate_evidence(h if h.base is h else resized(h))
         key = self.key(h)
         if anew or key not in self.visited or self.visited[key].score < h.score:
             self.visited[key] = h
