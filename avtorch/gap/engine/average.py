@@ -3,9 +3,9 @@
 Beside its effects every hypothesis may have a slow random force (gust or road), outliers of the accelerometer, and a
 free form of some family; all are valued in nats of the same likelihood. Each such composition supports labels. Its own
 is its effects by name. But an effect may be an error of the shape of the others, and then the label is without it; a
-free form may be that, too, or a cause without a name, `unknown`. A force map of the base is a part without a name beside
-those that have one; so is, in front of it, any other free form, and `unknown` is the label where no part has a name.
-Labels add up what supports them:
+free form may be that, too, or a cause without a name, `unknown`. A force map of the base is a part without a name
+beside those that have one; so is, in front of it, any other free form, and `unknown` is the label where no part has a
+name. Labels add up what supports them:
 
     P(label) ~ sum exp(TEMPER (log evidence + log odds))
 """

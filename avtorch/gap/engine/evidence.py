@@ -3,8 +3,9 @@
     log E = min(gain below 10 Hz, gain of the whole band) + log integral over errors of shape + log prior
             + d/2 log 2 pi - 1/2 log det H
 
-Gains are over the base, the hypothesis without effects and without a force map. Sizes have a heavy-tailed prior (Student, three degrees of
-freedom) that vanishes where an effect would make no difference (non-local; Johnson and Rossell 2010).
+Gains are over the base, the hypothesis without effects and without a force map. Sizes have a heavy-tailed prior
+(Student, three degrees of freedom) that vanishes where an effect would make no difference (non-local; Johnson and
+Rossell 2010).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Bases with a force map: what a map would gain beside a hypothesis, and the map fitted into the command.
 
-Three bases compete in the same evidence: K u, K u with a resistance R(v), and any F(u, v). The price of a map is linear,
-one Gram matrix for all sizes. A base is its fit: lag, gain, recorder and map together, the prior size of the map chosen
-anew from round to round, and all sizes summed in the evidence.
+Three bases compete in the same evidence: K u, K u with a resistance R(v), and any F(u, v). The price of a map is
+linear, one Gram matrix for all sizes. A base is its fit: lag, gain, recorder and map together, the prior size of the
+map chosen anew from round to round, and all sizes summed in the evidence.
 """
 
 from __future__ import annotations

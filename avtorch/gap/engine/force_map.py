@@ -30,7 +30,7 @@ _U_QUANTILES = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)  # of what was dr
 _V_QUANTILES = (0.0, 0.1, 0.35, 0.65, 0.9, 1.0)
 _APART = 0.1  # standard deviations between knots, least
 _SPEED_SPAN_MPS = 2.0  # least distance of the outer knots at which a dependence on speed is a question at all
-_SEEN = 1e-4  # mean square of a curve over the driven rows, relative to the most that is seen, below which it is left out
+_SEEN = 1e-4  # mean square of a curve over the driven rows, relative to the most, below which it is left out
 _SLACK = 1e-9  # on the diagonal of C, for its root
 
 

@@ -74,7 +74,7 @@ class FreeFormFit(NamedTuple):
     """Evidence of a free form beside a hypothesis.
 
     `nats` over the hypothesis without it; `residual` (channel, frame, bin) that is left, None where nothing can be
-    told; `coefficients` (column,) of the form, or the course (frame,) of what wanders; `size` the likeliest of the form.
+    told; `coefficients` (column,) of the form, or the course (frame,) of what wanders; `size`: likeliest of the form.
     """
 
     nats: float
@@ -274,7 +274,7 @@ def linear_evidence(
         noise = (products @ left) @ left / data.band_size[:, None, None]
         if integrated:
             unsure = cho_solve(factor, np.eye(len(precision)))
-            spread = np.tensordot(products[..., 1:, 1:], unsure, 2) / data.band_size[:, None, None]
+            spread = np.einsum("bcdkl,kl->bcd", products[..., 1:, 1:], unsure) / data.band_size[:, None, None]
         noise += spread + _LEAST * np.trace(noise, axis1=1, axis2=2)[:, None, None] * np.eye(data.channel_count)
         gain = min(claimed(data, noise) - before[0], claimed(data, noise, math.inf) - before[1])
         gain += 0.5 * freedom(data, noise, spread) if integrated else 0.0

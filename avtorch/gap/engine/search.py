@@ -52,8 +52,8 @@ class Search:
     `ONE_CHANNEL_HZ`: the car's own unnamed dynamics then belong to the base.
 
     `most_fits` bounds what it may cost (0: by the length of the drive), `stop()` ends it where it returns True;
-    `complete` tells whether one of them did. `visited` maps a set (names, and whether each has an onset; the name of its
-    force map) to its best hypothesis. `map_bases`: bases with a force map that sets have grown from.
+    `complete` tells whether one of them did. `visited` maps a set (names, and whether each has an onset; the name of
+    its force map) to its best hypothesis. `map_bases`: bases with a force map that sets have grown from.
     """
 
     base: Hypothesis
@@ -97,9 +97,10 @@ class Search:
         """The best set where the car's force may be any map: sets grow from each base with a map that could win.
 
         A map competes with the names that were found without it: it has to gain something, beside these or by itself,
-        and not be far behind them. Where it does not, nothing changes.
+        and not be far behind them. Where it does not, nothing changes. With one channel nothing tells a map from the
+        base's own unnamed dynamics: there names stand alone.
         """
-        if self._ended() or self.base.data.channel_count == 1:  # there a map and the base's own dynamics are alike
+        if self._ended() or self.base.data.channel_count == 1:
             return best
         more = best.score - self.base.score
         alone, beside = prices(self.base), prices(best) if more > 0 else []

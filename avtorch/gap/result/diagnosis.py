@@ -228,9 +228,10 @@ class Diagnosis(Displayed):
     def to_dict(self) -> dict[str, Any]:
         """The object of `diagnosis.json`, schema `avtorch.diagnosis/2`, or `/1` where there is no budget.
 
-        Beyond the schema's keys it has `parts` (name or null, family, form, size and probability), `moved`, `onset_s`, `plausible` and `plausibility` of each effect, the last two
-        of the verdict, `onset_from_start_s`, `setting`, `remaining`, `complete`, `not_tried` (`effects` by name;
-        `pairs`, of which "all", "some", "none" were tried, or "lost") and `notes`.
+        Beyond the schema's keys it has `parts` (name or null, family, form, size and probability), `moved`, `onset_s`,
+        `plausible` and `plausibility` of each effect, the last two of the verdict, `onset_from_start_s`, `setting`,
+        `remaining`, `complete`, `not_tried` (`effects` by name; `pairs`, of which "all", "some", "none" were tried, or
+        "lost") and `notes`.
         """
         return {
             "schema": f"avtorch.diagnosis/{1 if self.budget is None else 2}",

@@ -29,7 +29,7 @@ from avtorch.io import Log
 from tests.gap.cars import log_of
 
 BEND, LAG, GAIN, DELAY = 0.5, 0.35, 0.95, 0.3
-"""The bend [s²/m] of commands of 0.7 m/s²: as of 0.15 where they are twice that and more; lag [s], gain, dead time [s]."""
+"""The bend [s²/m] of commands of 0.7 m/s², as of 0.15 where they are thrice that; lag [s], gain, dead time [s]."""
 FEW = ("dead_time", "constant_resistance", "sensor_bias")
 
 
