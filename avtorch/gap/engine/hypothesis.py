@@ -183,8 +183,6 @@ class Hypothesis:
             grid.accel0,
             self.shift_speeds,
             self.reference_speed,
-            float(data.time[0]),
-            max(float(data.time[-1] - data.time[0]), 1.0),
             accel,
             gained,
         )

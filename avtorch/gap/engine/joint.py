@@ -49,7 +49,7 @@ NOISE_COUNTS = 4.0
 SIZES = (0.03, 0.1, COEFFICIENT_SD)
 """Prior standard deviations of free forms' coefficients, of which the likeliest stands [of the demand]."""
 _BLOCK_S, _FEWEST_BLOCKS = 10.0, 5
-NO_CHANGE = frozenset({"gain_change", "gain_change/drift", "gear_shift", "command_hold", "dead_time", "~linear"})
+NO_CHANGE = frozenset({"gain_change", "gear_shift", "command_hold", "dead_time", "~linear"})
 """What is no change of a car between drives: of one drive, of chance, or a change of T_L, K_L and dead time."""
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 

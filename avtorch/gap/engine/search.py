@@ -8,6 +8,7 @@ turn. The answer is not the last set but the average of all visited ones (`avera
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -28,6 +29,7 @@ _MOST_FITS, _FEWEST_FITS = 160, 40  # of a search; a hard case of five minutes t
 _GRID_FITS = 4e6  # fits times grid points: what a long drive may cost
 _WIDTH, _LATER_WIDTH = 9, 6  # effects fitted from the base, and from a set
 _FINISHED = 3  # of these, how many are finished
+_RAMPS = 10  # of a gain that changes, from a second to the drive's length
 _CUTS = 12  # onsets at which a response's size is computed; between them it is interpolated
 _MARGIN_S = 8.0  # no onset this near to an end of the drive
 _LEAST_PROMISE = 1.5  # nats: less is the gain of a parameter that does nothing
@@ -210,6 +212,8 @@ class Search:
         if "gear_shift" in h.effects and not self._shifts_refined:
             h = refined_shift_speeds(h)
             self._shifts_refined = True
+        if "gain_change" in h.effects:
+            h = other_ramp(h)
         for e in list(h.onsets):
             h = refined_onset(h, e)
         return h
@@ -396,7 +400,8 @@ def _onsets(
         free = projection(whiten(data, h.covariance, h.response(values, acts) - h.predicted))
         n, gain = float(free @ free), float(free @ projection.residual)
         if n > 1e-9 and (gain > 0 or not e.one_sided):
-            scaled = tuple(x * float(np.clip(gain / n, -4, 4)) for x in start) if len(start) == 1 else start
+            share = float(np.clip(gain / n, -4, 4)) if len(start) == 1 or e.onset == "must" else 1.0
+            scaled = (share * start[0], *start[1:])
             out.append(Promise(projection.nats(free) - 3.0, e.name, scaled, onset))
         priced[np.abs(data.time - onset) < data.hop_s] = 0
     return out
@@ -444,6 +449,23 @@ def other_limit(h: Hypothesis) -> Hypothesis:
         if objective(new) > value + 0.1:
             best, value = new, objective(new)
     return best
+
+
+def other_ramp(h: Hypothesis) -> Hypothesis:
+    """The gain's change over another time: a step found it, at the middle of what may last as long as the drive."""
+    data = h.data
+    first, last = float(data.time[0]), float(data.time[-1])
+    ramp = math.exp(h["gain_ramp"])
+    middle = h.onsets["gain_change"] + 0.5 * ramp
+    tried = []
+    for longer in np.geomspace(1.0, max(last - first, 2.0), _RAMPS):
+        for at in (middle, middle - 0.25 * longer, middle + 0.25 * longer):
+            new = h.copy()
+            new["gain_ramp"] = math.log(longer)
+            new.onsets["gain_change"] = min(max(at - 0.5 * longer, first), last)
+            tried.append(new.evaluate())
+    best = max(tried, key=objective)
+    return max(h, fit(best, 6), key=objective)
 
 
 def refined_onset(h: Hypothesis, effect: str) -> Hypothesis:
