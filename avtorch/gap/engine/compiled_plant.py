@@ -47,7 +47,7 @@ _NEUTRAL = NEUTRAL.copy()
 _COUNT = len(NEUTRAL)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def modes(square: float, T: float, h: float) -> tuple[float, float, float, float]:  # pragma: no cover - compiled
     """Transition over `h` of (a - g, tau² a'), `square` = tau² (see `simulator.actuator.modes_over`)."""
     bend = T * T - 4.0 * square
@@ -69,14 +69,14 @@ def modes(square: float, T: float, h: float) -> tuple[float, float, float, float
     return C + half, S, -square * S, C - half
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _risen(since: float, ramp: float) -> float:  # pragma: no cover - compiled
     """Integral of a rise over `ramp` [s], `since` [s] its begin (see `effects.gain_change`)."""
     within = min(max(since, 0.0), ramp)
     return within * within / (2.0 * ramp) + max(since - ramp, 0.0)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _commands(  # pragma: no cover - compiled
     p: FloatArray, acts: FloatArray, time: FloatArray, command: FloatArray, starts: BoolArray, out: FloatArray
 ) -> None:
@@ -99,7 +99,7 @@ def _commands(  # pragma: no cover - compiled
         out[k] = play
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def simulate(  # pragma: no cover - compiled
     p: FloatArray,
     acts: FloatArray,
@@ -298,7 +298,7 @@ def simulate(  # pragma: no cover - compiled
             free_y = y
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def read_late(  # pragma: no cover - compiled
     rows: FloatArray, time: FloatArray, values: FloatArray, delay: float, out: FloatArray
 ) -> None:

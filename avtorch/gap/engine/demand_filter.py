@@ -150,7 +150,7 @@ def response_rows(h: Hypothesis) -> int:
     return round((3 * h["T_L"] + coordinate_from_start(h, "dead_time")) / h.data.dt)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def take_out(  # pragma: no cover - compiled
     score: FloatArray, information: FloatArray, cover: FloatArray, pulse: FloatArray, first: int, sign: float
 ) -> None:

@@ -189,7 +189,7 @@ def demand_response(h: Hypothesis, demands: FloatArray, lags: FloatArray, *, bac
     return data.transform(rows).reshape(len(demands), *h.predicted.shape)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def first_order(  # pragma: no cover - compiled
     time: FloatArray, starts: BoolArray, demand: FloatArray, lag: float
 ) -> tuple[FloatArray, FloatArray]:

@@ -169,7 +169,7 @@ class Hypothesis:
     ) -> tuple[FloatArray, FloatArray]:
         """The accelerometer's reading [m/s²] and the speed gained in its stretch [m/s] on the grid, (grid,) each."""
         p = self.values if values is None else values
-        data, grid = self.data, self.data.grid
+        grid = self.data.grid
         if self.baseline is not None or any(EFFECTS[e].kind is not None for e in self.effects):
             return simulator_signals(self, p, onsets)
         accel, gained = np.empty(len(grid.time)), np.empty(len(grid.time))

@@ -158,7 +158,7 @@ def _packed(energy: FloatArray, alone: float) -> FloatArray:
     return packed
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _noise_beside(  # pragma: no cover - compiled
     observed: FloatArray, energy: FloatArray, sizes: FloatArray, errors: FloatArray, channels: int, iterations: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -209,12 +209,12 @@ def _noise_beside(  # pragma: no cover - compiled
                     g0, g1, g2 = _geometric_mean(a2 / det, -a1 / det, a0 / det, b0, b1, b2)
                     s0, s1, s2 = _proper(g0, g1, g2, least0, least2)
             nats[e, band] = value
-            covariances[e, band] = (s0, s1, s2)
+            covariances[e, band, 0], covariances[e, band, 1], covariances[e, band, 2] = s0, s1, s2
             counts[e, band] = effective
     return nats, covariances, counts
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _proper(  # pragma: no cover - compiled
     s0: float, s1: float, s2: float, least0: float, least2: float
 ) -> tuple[float, float, float]:
@@ -224,7 +224,7 @@ def _proper(  # pragma: no cover - compiled
     return s0, min(max(s1, -limit), limit), s2
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _geometric_mean(  # pragma: no cover - compiled
     p0: float, p1: float, p2: float, q0: float, q1: float, q2: float
 ) -> tuple[float, float, float]:

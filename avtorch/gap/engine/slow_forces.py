@@ -197,7 +197,7 @@ def wishart_profile(covariance: FloatArray, counts: FloatArray, power: FloatArra
     return nats.reshape(power.shape), variances.reshape(*power.shape, 2)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _profile(covariance: FloatArray, counts: FloatArray, power: FloatArray) -> tuple[FloatArray, FloatArray]:
     nats, variances = np.empty(power.shape), np.empty((*power.shape, 2))
     for b in range(power.shape[1]):
@@ -232,7 +232,7 @@ def _profile(covariance: FloatArray, counts: FloatArray, power: FloatArray) -> t
     return nats, variances
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _root(p: float, r: float, k: float) -> float:
     """Root of k³ - k² + (2 p r - p²) k - p² by Newton's method from `k`.
 
@@ -255,7 +255,7 @@ def _root(p: float, r: float, k: float) -> float:
     return k
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _cost(s00: float, s11: float, s01: float, P: float, a: float, c: float) -> float:
     """log det V + tr V^-1 S."""
     determinant = a * c + P * (a + c)
