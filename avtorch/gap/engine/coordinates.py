@@ -191,11 +191,11 @@ EFFECTS: dict[str, EngineEffect] = {
             ),
             ((-0.3, 0.0), (0.0, 0.6), (-0.3, 0.6), (0.3, 0.5)),
         ),
-        EngineEffect("second_order_actuator", (_square,), ((0.01,), (0.04,), (0.1,)), "never"),
+        EngineEffect("second_order_actuator", (_square,), ((0.01,), (0.04,), (0.1,), (0.7,)), "never"),
         EngineEffect(
             "second_order_actuator@late",
             (_square, Coordinate("log_lag_ratio", "lag_ratio", "log", -2.5, 2.0, 0.7)),
-            ((0.02, -0.3), (0.1, -1.0)),
+            ((0.02, -0.3), (0.1, -1.0), (0.7, 0.0)),
             "must",
         ),
         EngineEffect(

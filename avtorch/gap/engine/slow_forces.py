@@ -302,7 +302,10 @@ def slow_forces(
         return _one_channel(data, covariance[:, 0, 0], counts, power).sum(-1)
 
     lags = np.atleast_1d(values[INDEX["T_L"]] if lags is None else lags)
-    unit = process_spectrum(frequency, lags, values[INDEX["square_period"]]) @ energy.T
+    spectra = process_spectrum(frequency, lags)
+    if values[INDEX["square_period"]] > 0:  # a second pole is passed by what disturbs the actuator, not the body
+        spectra = np.concatenate([spectra, process_spectrum(frequency, lags, values[INDEX["square_period"]])])
+    unit = spectra @ energy.T
     process = PROCESS_NOISE_GRID[:, None] ** 2 * unit[:, None]  # (lag, size, band)
     prior = _log_normal(PROCESS_NOISE_GRID, PROCESS_NOISE)
     alone = nats(process) + prior
