@@ -6,7 +6,7 @@ R is the residual of a hypothesis in lapped coefficients, J its Jacobian, so tha
 and z_j the response of all channels to a demand of a form: other lags (dynamics), other lags by sign, hinges of the
 command times hats of the speed (force map), a sine (tone), a gain or a delay that wanders as an Ornstein-Uhlenbeck
 process over the frames. The noise's covariance stays free in every band, as in `likelihood`; coefficients are
-integrated out by Laplace's approximation. A form's gain is the lesser of that below `CLAIM_HZ` and that of all bands,
+integrated out by Laplace's approximation. A form's gain is the lesser of that below `claim_hz` and that of all bands,
 as everywhere: a closed loop's echoes cancel over the whole band only (Ljung 1999, section 13.4).
 
 The mirrored bank, whose lags run backwards in time, is a negative control for linear dynamics: no car answers before

@@ -31,7 +31,8 @@ from numba import njit
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.priors import CLAIM_HZ, SHAPE_ERROR, SHAPE_ERROR_FOUND, TEMPER
+from avtorch.gap.engine.likelihood import claim_bands
+from avtorch.gap.engine.priors import SHAPE_ERROR, SHAPE_ERROR_FOUND, TEMPER
 
 RELATIVE_ERRORS = (0.0, 0.015, 0.03, 0.06, 0.12, 0.24)
 """Relative errors of a response [-] at which the likelihood is evaluated: doublings around `SHAPE_ERROR`."""
@@ -41,7 +42,7 @@ _FOUND_ONE_BY_ONE = "command_hold"
 
 
 class ShapeLikelihood(NamedTuple):
-    """What the relative errors of a grid leave of a residual, in the bands below `CLAIM_HZ`.
+    """What the relative errors of a grid leave of a residual, in the bands below `claim_hz`.
 
     `nats` (error,): log likelihood over that of an exact shape; `covariances` (error, band, channel, channel): of the
     noise, per coefficient; `counts` (error, band): effective number of coefficients per channel that measured it.
@@ -93,7 +94,7 @@ def relative_size(data: DriveData, covariance: FloatArray, companion: FloatArray
     """Relative amplitude of a companion's response (channel, frame, bin) over effects of an energy, where it acts.
 
     Both are measured in units of the noise, `covariance` (band, channel, channel); the mean of the logarithm of the
-    ratio over frames and bands below `CLAIM_HZ` is weighted by the companion's own information. `energy`: of
+    ratio over frames and bands below `claim_hz` is weighted by the companion's own information. `energy`: of
     `effect_energy`.
     """
     bands = claim_bands(data)
@@ -109,7 +110,7 @@ def shape_likelihood(
     residual: FloatArray,
     energy: FloatArray | None,
     iterations: int = 30,
-    fmax: float = CLAIM_HZ,
+    fmax: float | None = None,
 ) -> ShapeLikelihood | None:
     """Likelihood of each of `RELATIVE_ERRORS` in the effects behind a residual (channel, frame, bin).
 
@@ -142,11 +143,6 @@ def shape_log_odds(relative: float, gain: float, effects: Iterable[str], temper:
     scale = error_scale(effects)
     log_density_at_zero = 0.5 * math.log(2.0 / math.pi) - math.log(scale)
     return min(log_density_at_zero / temper, max(gain, 0.0)) - 0.5 * (relative / scale) ** 2 / temper
-
-
-def claim_bands(data: DriveData, fmax: float = CLAIM_HZ) -> int:
-    """Number of bands that begin below `fmax` [Hz], at least one."""
-    return max(int(np.searchsorted(data.frequency[data.band_edges[:-1]], fmax)), 1)
 
 
 def _packed(energy: FloatArray, alone: float) -> FloatArray:
