@@ -51,7 +51,7 @@ def effect_values(h: Car, effect: str) -> dict[str, Any]:
     elif own.base in ("speed_dependent_lag", "speed_dependent_gain"):
         out["mean_speed"] = h.data.reference_speed
     elif effect == "driveline_oscillation":
-        out["amplitude"] = 0.0
+        out["quadrature"] = 0.0
     elif effect == "command_hold":
         rows = sum(j - i for i, j in h.lost)
         out["hold_fraction"] = rows / len(h.data.time)

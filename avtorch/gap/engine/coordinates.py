@@ -240,7 +240,7 @@ EFFECTS: dict[str, EngineEffect] = {
             "driveline_oscillation",
             (
                 # a ring follows a step in its direction; the other sign would be one more lag
-                Coordinate("ring_quadrature", "quadrature", "value", 0, 4, 0.3, FAINT_OF_RANGE * 0.5 / 3),
+                Coordinate("ring_amplitude", "amplitude", "value", 0, 8, 0.3, FAINT_OF_RANGE * 0.5 / 3),
                 _nuisance("ring_frequency", "frequency_hz", 2.5, 1.2, 0.8, 5.5),
             ),
             _RING,
