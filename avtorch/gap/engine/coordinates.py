@@ -165,7 +165,7 @@ EFFECTS: dict[str, EngineEffect] = {
     e.name: e
     for e in (
         EngineEffect(
-            "dead_time", (_sized("dead_time", "dead_time", "delay_s", "value", 0, 1.5),), ((0.06,), (0.2,), (0.4,))
+            "dead_time", (_sized("dead_time", "dead_time", "delay_s", "value", 0, 1.5),), ((0.06,), (0.2,), (0.4,), (0.8,))
         ),
         EngineEffect(
             "dead_band",

@@ -370,7 +370,8 @@ def _onsets(
     whitened: FloatArray,
     steps: FloatArray,
 ) -> list[Promise]:
-    """The two best onsets: the residual's adjoint prices all rows at once, then the response is computed."""
+    """The two best onsets, and those of effects that are in: the residual's adjoint prices all rows at once, then the
+    response is computed."""
     data = h.data
     cuts = np.unique(np.round(np.linspace(0.12, 0.88, _CUTS) * data.frame_count).astype(int))
     cuts = cuts[(cuts > 0) & (cuts < data.frame_count)]
@@ -388,12 +389,15 @@ def _onsets(
     size = np.maximum(size, 0.15 * max(sizes))
     inside = (data.time > data.time[0] + _MARGIN_S) & (data.time < data.time[-1] - _MARGIN_S)
     priced = np.where(inside & ((gains > 0) | (not e.one_sided)), 0.5 * gains**2 / (size + 1), 0.0)
-    out = []
+    tried = [(onset, 0.0) for onset in sorted(set(h.onsets.values()))]
     for _ in range(2):
         row = int(priced.argmax())
         if priced[row] <= 0:
             break
-        onset = float(data.time[row])
+        tried.append((float(data.time[row]), 3.0))
+        priced[np.abs(data.time - data.time[row]) < data.hop_s] = 0
+    out = []
+    for onset, price in tried:
         acts = h.onset_vector()
         for c in e.coordinates:
             acts[INDEX[c.name]] = onset
@@ -402,8 +406,7 @@ def _onsets(
         if n > 1e-9 and (gain > 0 or not e.one_sided):
             share = float(np.clip(gain / n, -4, 4)) if len(start) == 1 or e.onset == "must" else 1.0
             scaled = (share * start[0], *start[1:])
-            out.append(Promise(projection.nats(free) - 3.0, e.name, scaled, onset))
-        priced[np.abs(data.time - onset) < data.hop_s] = 0
+            out.append(Promise(projection.nats(free) - price, e.name, scaled, onset))
     return out
 
 
@@ -469,8 +472,10 @@ def other_ramp(h: Hypothesis) -> Hypothesis:
 
 
 def refined_onset(h: Hypothesis, effect: str) -> Hypothesis:
-    """The hypothesis with the onset of one effect refined: frames tell it roughly, what sets in at once sharply."""
+    """The hypothesis with the onset of one effect refined, and of those that set in with it: frames tell it roughly,
+    what sets in at once sharply."""
     data = h.data
+    together = [e for e, onset in h.onsets.items() if onset == h.onsets[effect]]
     first, last = float(data.time[0]) + 5, float(data.time[-1]) - 5
     begun = h.onsets[effect]
     best = h
@@ -479,7 +484,7 @@ def refined_onset(h: Hypothesis, effect: str) -> Hypothesis:
         if not first < onset < last:
             return None
         new = of.copy()
-        new.onsets[effect] = onset
+        new.onsets |= dict.fromkeys(together, onset)
         new.evaluate()
         return new if new.log_likelihood > best.log_likelihood + 0.05 else None
 
