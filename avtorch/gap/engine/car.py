@@ -44,17 +44,14 @@ def effect_values(h: Car, effect: str) -> dict[str, Any]:
     own = EFFECTS[effect]
     out: dict[str, Any] = {c.parameter: c.value(h[c.name]) for c in own.coordinates}
     if effect == "gain_change":
-        out |= {"change_s": h.onsets[effect], "ramp_s": 0.0}
-    elif effect == "gain_change/drift":
-        first, last = float(h.data.time[0]), float(h.data.time[-1])
-        out |= {"change_s": first, "ramp_s": max(last - first, 1.0)}
+        out["change_s"] = h.onsets[effect]
     elif effect == "gear_shift":
         out["speeds"] = tuple(float(s) for s in h.shift_speeds)
         out["rearm_mps"] = h["shift_hysteresis"]
     elif own.base in ("speed_dependent_lag", "speed_dependent_gain"):
         out["mean_speed"] = h.data.reference_speed
     elif effect == "driveline_oscillation":
-        out["amplitude"] = 0.0
+        out["quadrature"] = 0.0
     elif effect == "command_hold":
         rows = sum(j - i for i, j in h.lost)
         out["hold_fraction"] = rows / len(h.data.time)
@@ -108,7 +105,7 @@ def simulator_signals(h: Car, values: FloatArray, onsets: FloatArray | None = No
     time = h.data.grid.time
     if "gain_change" in h.effects:  # has its moment in its own equation
         onset = float(acts[INDEX[EFFECTS["gain_change"].coordinates[0].name]])
-        with_all.onsets["gain_change"] = max(onset, float(time[0]))
+        with_all.onsets["gain_change"] = max(onset, float(time[0]) - math.exp(values[INDEX["gain_ramp"]]))
     accel, gained = _signals(with_all)
     for e in h.effects:
         own = EFFECTS[e].coordinates

@@ -30,7 +30,7 @@ from avtorch.gap.engine.joint import (
     products,
 )
 from avtorch.gap.engine.likelihood import log_sum
-from avtorch.gap.engine.priors import CLAIM_HZ, EFFECT_NATS, TEMPER, UNKNOWN_NATS
+from avtorch.gap.engine.priors import EFFECT_NATS, TEMPER, UNKNOWN_NATS
 from avtorch.gap.engine.shape_error import effect_energy, relative_size, shape_log_odds
 
 Progress = Callable[[str, int, int], None]
@@ -304,7 +304,7 @@ def _own_forms(model: JointModel, fit: JointFit, acting: list[FloatArray]) -> fl
             noise = [noise_left(p, left, h.data, k) for p, h, k in zip(P, fit.sides, model.known, strict=True)]
         whole, low = (
             sum(nats_of(h.data, s, k, fmax) for h, s, k in zip(fit.sides, noise, model.known, strict=True)) - before
-            for fmax, before in ((math.inf, fit.log_likelihood), (CLAIM_HZ, fit.claimed))
+            for fmax, before in ((math.inf, fit.log_likelihood), (None, fit.claimed))
         )
         occam = -count * math.log(sd) - 0.5 * float(np.linalg.slogdet(H)[1] - np.linalg.slogdet(fit.information)[1])
         best = max(best, min(low, whole) - 0.5 * float(b @ prior @ b) + occam)

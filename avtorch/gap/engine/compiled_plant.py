@@ -32,7 +32,7 @@ _BAND, _PLAY, _DELAY = INDEX["dead_band"], INDEX["backlash"], INDEX["dead_time"]
 _BRAKE_GAIN, _BRAKE_LAG = INDEX["log_brake_gain"], INDEX["log_brake_lag"]
 _SQUARE, _LAG_RATIO, _JERK = INDEX["square_period"], INDEX["log_lag_ratio"], INDEX["inverse_jerk"]
 _LAG_SLOPE, _GAIN_SLOPE = INDEX["lag_slope"], INDEX["gain_slope"]
-_STEP, _DRIFT = INDEX["gain_step"], INDEX["gain_drift"]
+_STEP, _RAMP = INDEX["gain_step"], INDEX["gain_ramp"]
 _DEPTH, _DURATION, _HYSTERESIS = INDEX["shift_depth"], INDEX["shift_duration"], INDEX["shift_hysteresis"]
 _RING_A, _RING_Q = INDEX["ring_amplitude"], INDEX["ring_quadrature"]
 _RING_F, _RING_Z = INDEX["ring_frequency"], INDEX["ring_damping"]
@@ -47,7 +47,7 @@ _NEUTRAL = NEUTRAL.copy()
 _COUNT = len(NEUTRAL)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def modes(square: float, T: float, h: float) -> tuple[float, float, float, float]:  # pragma: no cover - compiled
     """Transition over `h` of (a - g, tau² a'), `square` = tau² (see `simulator.actuator.modes_over`)."""
     bend = T * T - 4.0 * square
@@ -69,14 +69,14 @@ def modes(square: float, T: float, h: float) -> tuple[float, float, float, float
     return C + half, S, -square * S, C - half
 
 
-@njit(cache=True, fastmath=True)
-def _stepped(since: float) -> float:  # pragma: no cover - compiled
-    """Integral of a step that rises within a microsecond, `since` [s] its begin (see `effects.gain_change`)."""
-    within = min(max(since, 0.0), 1e-6)
-    return within * within / 2e-6 + max(since - 1e-6, 0.0)
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _risen(since: float, ramp: float) -> float:  # pragma: no cover - compiled
+    """Integral of a rise over `ramp` [s], `since` [s] its begin (see `effects.gain_change`)."""
+    within = min(max(since, 0.0), ramp)
+    return within * within / (2.0 * ramp) + max(since - ramp, 0.0)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _commands(  # pragma: no cover - compiled
     p: FloatArray, acts: FloatArray, time: FloatArray, command: FloatArray, starts: BoolArray, out: FloatArray
 ) -> None:
@@ -99,7 +99,7 @@ def _commands(  # pragma: no cover - compiled
         out[k] = play
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def simulate(  # pragma: no cover - compiled
     p: FloatArray,
     acts: FloatArray,
@@ -110,8 +110,6 @@ def simulate(  # pragma: no cover - compiled
     accel0: FloatArray,
     shift_speeds: FloatArray,
     reference_speed: float,
-    first_s: float,
-    length_s: float,
     accel: FloatArray,
     gained: FloatArray,
 ) -> None:
@@ -119,14 +117,14 @@ def simulate(  # pragma: no cover - compiled
 
     `p` (parameter,) values, `acts` (parameter,) the times [s] from which they act; `time`, `command`, `speed`, `starts`
     (grid,): steps, held commands, the speed that effects read, and where stretches start; `accel0` (grid,): the car's
-    acceleration there. `shift_speeds` (gear,) [m/s]; `reference_speed` [m/s], at which slopes are neutral; `first_s`
-    and `length_s` [s] of the drive, for a gain that drifts.
+    acceleration there. `shift_speeds` (gear,) [m/s]; `reference_speed` [m/s], at which slopes are neutral.
     """
     n = len(time)
     sent = np.empty(n)
     _commands(p, acts, time, command, starts, sent)
     q = p.copy()
     gears = len(shift_speeds)
+    ramp = math.exp(p[_RAMP])
     above = np.zeros(gears, np.bool_)
     since = np.full(gears, -1e9)
     a = w = slewed = ring_y = ring_r = free_y = free_r = reading = v_gained = 0.0
@@ -233,10 +231,8 @@ def simulate(  # pragma: no cover - compiled
         if q[_LAG_RATIO] != 0.0:
             lag *= math.exp(q[_LAG_RATIO])
         if p[_STEP] != 0.0 and t + h > acts[_STEP]:
-            begun = max(acts[_STEP], t - 1.0)  # long ago is whole, and keeps its digits
-            gain *= 1.0 + p[_STEP] * (_stepped(t + h - begun) - _stepped(t - begun)) / h
-        if p[_DRIFT] != 0.0:
-            gain *= 1.0 + p[_DRIFT] * (t + 0.5 * h - first_s) / length_s
+            begun = max(acts[_STEP], t - 1.0 - ramp)  # long ago is whole, and keeps its digits
+            gain *= 1.0 + p[_STEP] * (_risen(t + h - begun, ramp) - _risen(t - begun, ramp)) / h
         if lost > 0.0 and u2 > 0.0:
             gain *= 1.0 - q[_DEPTH] * lost
         before = a
@@ -302,7 +298,7 @@ def simulate(  # pragma: no cover - compiled
             free_y = y
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def read_late(  # pragma: no cover - compiled
     rows: FloatArray, time: FloatArray, values: FloatArray, delay: float, out: FloatArray
 ) -> None:

@@ -25,7 +25,7 @@ NAMES = (
     *("T_L", "K_L", "accel_delay", "speed_delay", "accel_filter", "speed_filter"),
     *("dead_time", "dead_band", "backlash", "drive_limit", "brake_limit"),
     *("log_brake_gain", "log_brake_lag", "square_period", "log_lag_ratio", "inverse_jerk"),
-    *("lag_slope", "gain_slope", "gain_step", "gain_drift", "shift_depth", "shift_duration", "shift_hysteresis"),
+    *("lag_slope", "gain_slope", "gain_step", "gain_ramp", "shift_depth", "shift_duration", "shift_hysteresis"),
     *("ring_amplitude", "ring_quadrature", "ring_frequency", "ring_damping", "drag", "wind", "resistance", "creep"),
     *("sensor_lag", "sensor_bias", "sensor_scale", "free_pole", "free_frequency"),
 )
@@ -38,6 +38,7 @@ NEUTRAL: FloatArray = np.zeros(len(NAMES))
 for _name, _value in {
     "T_L": 0.3,
     "K_L": 1.0,
+    "gain_ramp": -7.0,  # a millisecond
     "shift_duration": 0.35,
     "shift_hysteresis": 0.8,
     "ring_frequency": 2.0,
@@ -135,8 +136,8 @@ class EngineEffect:
 
 
 def base_name(effect: str) -> str:
-    """The effect's name in the table: "gain_change/drift" is "gain_change"."""
-    return effect.split("/")[0].split("@")[0]
+    """The effect's name in the table: "second_order_actuator@late" is "second_order_actuator"."""
+    return effect.split("@")[0]
 
 
 def _sized(name: str, effect: str, parameter: str, link: Link, low: float, high: float, sign: int = 1) -> Coordinate:
@@ -164,7 +165,7 @@ EFFECTS: dict[str, EngineEffect] = {
     e.name: e
     for e in (
         EngineEffect(
-            "dead_time", (_sized("dead_time", "dead_time", "delay_s", "value", 0, 1.5),), ((0.06,), (0.2,), (0.4,))
+            "dead_time", (_sized("dead_time", "dead_time", "delay_s", "value", 0, 1.5),), ((0.06,), (0.2,), (0.4,), (0.8,))
         ),
         EngineEffect(
             "dead_band",
@@ -190,11 +191,11 @@ EFFECTS: dict[str, EngineEffect] = {
             ),
             ((-0.3, 0.0), (0.0, 0.6), (-0.3, 0.6), (0.3, 0.5)),
         ),
-        EngineEffect("second_order_actuator", (_square,), ((0.01,), (0.04,), (0.1,)), "never"),
+        EngineEffect("second_order_actuator", (_square,), ((0.01,), (0.04,), (0.1,), (0.7,)), "never"),
         EngineEffect(
             "second_order_actuator@late",
             (_square, Coordinate("log_lag_ratio", "lag_ratio", "log", -2.5, 2.0, 0.7)),
-            ((0.02, -0.3), (0.1, -1.0)),
+            ((0.02, -0.3), (0.1, -1.0), (0.7, 0.0)),
             "must",
         ),
         EngineEffect(
@@ -217,13 +218,13 @@ EFFECTS: dict[str, EngineEffect] = {
             _SPEED,
         ),
         EngineEffect(
-            "gain_change", (_sized("gain_step", "gain_change", "gain_ratio", "less one", -0.9, 4),), ((0.2,),), "must"
-        ),
-        EngineEffect(
-            "gain_change/drift",
-            (_sized("gain_drift", "gain_change", "gain_ratio", "less one", -0.95, 4),),
-            ((0.2,),),
-            "never",
+            "gain_change",
+            (
+                _sized("gain_step", "gain_change", "gain_ratio", "less one", -0.9, 4),
+                Coordinate("gain_ramp", "ramp_s", "log", -3.0, 8.0, 1.9, mean=1.7),  # 0.5 to 60 s
+            ),
+            ((0.2, 0.0),),
+            "must",
         ),
         EngineEffect(
             "gear_shift",
@@ -239,7 +240,7 @@ EFFECTS: dict[str, EngineEffect] = {
             "driveline_oscillation",
             (
                 # a ring follows a step in its direction; the other sign would be one more lag
-                Coordinate("ring_quadrature", "quadrature", "value", 0, 4, 0.3, FAINT_OF_RANGE * 0.5 / 3),
+                Coordinate("ring_amplitude", "amplitude", "value", 0, 8, 0.3, FAINT_OF_RANGE * 0.5 / 3),
                 _nuisance("ring_frequency", "frequency_hz", 2.5, 1.2, 0.8, 5.5),
             ),
             _RING,

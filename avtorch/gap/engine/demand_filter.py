@@ -9,7 +9,7 @@ y_c = d_c h * w: h is the actuator (held rows, lag, second pole, dead time), d_c
 s (row,) being the score, the gradient of log L in the demand of every row, and A the information, which is Toeplitz as
 the noise is stationary: rho is the inverse cosine transform of |h(f)|² d(f)* S(f)^-1 d(f) (Turin 1960; Kay, Detection
 Theory, 1998, ch. 4). Where frames begin and end it is D A D, D (row,) being what they
-see. A pulse of L rows costs L products for s' w and L² / 2 for w' A w, and no simulation. Frequencies above `CLAIM_HZ`
+see. A pulse of L rows costs L products for s' w and L² / 2 for w' A w, and no simulation. Frequencies above `claim_hz`
 have no weight.
 """
 
@@ -22,9 +22,8 @@ from scipy.ndimage import maximum_filter1d
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import INDEX
-from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.drive_data import DriveData, one_pole
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.priors import CLAIM_HZ
 
 ComplexArray = np.typing.NDArray[np.complex128]
 
@@ -62,15 +61,16 @@ def channel_transfer(h: Hypothesis, frequency: FloatArray) -> ComplexArray:
         else:  # the central difference of a speed that the recorder may hold for some rows
             delay += 0.5 * (data.hold - 1) * data.dt
             gain = np.sinc(2 * frequency * data.dt)
-        keep = pole / (pole + data.dt)
-        shown.append(gain * np.exp(-1j * omega * delay) * (1 - keep) / (1 - keep * np.exp(-1j * omega * data.dt)))
+        keep, new, old = one_pole(max(pole, 1e-4), data.dt)
+        row = np.exp(-1j * omega * data.dt)
+        shown.append(gain * np.exp(-1j * omega * delay) * (new + old * row) / (1 - keep * row))
     return np.array(shown)
 
 
 def precision(data: DriveData, covariance: FloatArray) -> FloatArray:
-    """Inverse (bin, channel, channel) of the noise's `covariance` (band, channel, channel), 0 above `CLAIM_HZ`."""
+    """Inverse (bin, channel, channel) of the noise's `covariance` (band, channel, channel), 0 above `claim_hz`."""
     inverse = np.linalg.inv(covariance)
-    inverse[data.frequency[data.band_edges[:-1]] > CLAIM_HZ] = 0.0
+    inverse[data.frequency[data.band_edges[:-1]] > data.claim_hz] = 0.0
     return np.asarray(inverse[data.band_of_bin], np.float64)
 
 
@@ -150,7 +150,7 @@ def response_rows(h: Hypothesis) -> int:
     return round((3 * h["T_L"] + coordinate_from_start(h, "dead_time")) / h.data.dt)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def take_out(  # pragma: no cover - compiled
     score: FloatArray, information: FloatArray, cover: FloatArray, pulse: FloatArray, first: int, sign: float
 ) -> None:

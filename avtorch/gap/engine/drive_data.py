@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Self
@@ -22,7 +23,7 @@ from scipy.signal import lfilter
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.engine.compiled_plant import GRID_S
-from avtorch.gap.engine.priors import BAND_RATIO, FRAME_S, STANDSTILL_MPS, WARM_S
+from avtorch.gap.engine.priors import BAND_RATIO, CLAIM_HZ, FRAME_S, STANDSTILL_MPS, WARM_S
 from avtorch.io import Log
 from avtorch.io.log import AccelKind
 from avtorch.io.no_command import no_command
@@ -46,6 +47,13 @@ class Grid:
     speed: FloatArray = field(repr=False)
     starts: BoolArray = field(repr=False)
     accel0: FloatArray = field(repr=False)
+
+
+def one_pole(time_constant: float, dt: float) -> tuple[float, float, float]:
+    """y_k = keep y_{k-1} + new x_k + old x_{k-1}: one pole, exact where x is straight between rows of `dt` [s]."""
+    keep = math.exp(-dt / time_constant)
+    held = time_constant / dt * (1 - keep)
+    return keep, 1 - held, held - keep
 
 
 @dataclass(eq=False)
@@ -91,6 +99,11 @@ class DriveData:
     frequency: FloatArray = field(default_factory=lambda: np.zeros(0))
     band_edges: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     measured: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
+
+    @property
+    def claim_hz(self) -> float:
+        """Frequency [Hz] below which an explanation has to gain: `CLAIM_HZ`, at low rates half of what rows resolve."""
+        return min(CLAIM_HZ, 0.25 / self.dt)
 
     # reading -------------------------------------------------------------------------------------------------------
     @classmethod
@@ -304,13 +317,13 @@ class DriveData:
         return x[np.maximum(back, first)]
 
     def low_pass(self, x: FloatArray, time_constant: float) -> FloatArray:
-        """One pole with this mean delay [s], smooth from 0 on."""
+        """One pole of this time constant [s], at rest at the start of each stretch (see `one_pole`)."""
         if time_constant < 1e-4:
             return x
-        c = time_constant / (time_constant + self.dt)
+        keep, new, old = one_pole(time_constant, self.dt)
         out = np.empty_like(x)
         for i, j in zip(self.bounds[:-1], self.bounds[1:], strict=True):
-            out[i:j] = lfilter([1 - c], [1, -c], x[i:j], zi=[c * x[i]])[0]
+            out[i:j] = lfilter([new, old], [1, -keep], x[i:j], zi=[(1 - new) * x[i]])[0]
         return out
 
     # inside ----------------------------------------------------------------------------------------------------------

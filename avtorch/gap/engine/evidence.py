@@ -90,12 +90,12 @@ def _size_density(h: Hypothesis, effect: str) -> float:
 
 
 def _onset_odds(h: Hypothesis) -> float:
-    """An onset is one of as many as there are frames."""
-    total = 0.0
+    """A moment is one of as many as there are frames; several effects may set in at it."""
+    total = -len(set(h.onsets.values())) * math.log(max(h.data.frame_count, 4))
     for e in h.effects:
         when = EFFECTS[e].onset
         if e in h.onsets:
-            total += math.log(ONSET_ODDS / max(h.data.frame_count, 4))
+            total += math.log(ONSET_ODDS)
         elif when == "must":
             total += _IMPOSSIBLE
         elif when == "may":

@@ -6,7 +6,7 @@ R is the residual of a hypothesis in lapped coefficients, J its Jacobian, so tha
 and z_j the response of all channels to a demand of a form: other lags (dynamics), other lags by sign, curves over
 command and speed (force map), a sine (tone), a gain or a delay that wanders as an Ornstein-Uhlenbeck
 process over the frames. The noise's covariance stays free in every band, as in `likelihood`; coefficients are
-integrated out by Laplace's approximation. A form's gain is the lesser of that below `CLAIM_HZ` and that of all bands,
+integrated out by Laplace's approximation. A form's gain is the lesser of that below `claim_hz` and that of all bands,
 as everywhere: a closed loop's echoes cancel over the whole band only (Ljung 1999, section 13.4).
 
 The mirrored bank, whose lags run backwards in time, is a negative control for linear dynamics: no car answers before
@@ -203,7 +203,7 @@ def demand_response(h: Hypothesis, demands: FloatArray, lags: FloatArray, *, bac
     return data.transform(rows).reshape(len(demands), *h.predicted.shape)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def first_order(  # pragma: no cover - compiled
     time: FloatArray, starts: BoolArray, demand: FloatArray, lag: float
 ) -> tuple[FloatArray, FloatArray]:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from avtorch.arrays import FloatArray
+from avtorch.arrays import BoolArray, FloatArray
 from avtorch.gap.engine.coordinates import COORDINATES, INDEX
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance, log_likelihood, whiten
@@ -165,8 +165,9 @@ def whitened_jacobian(h: Hypothesis, derivatives: FloatArray) -> FloatArray:
 def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05, names: Sequence[str] | None = None) -> Hypothesis:
     """The hypothesis at the maximum of `objective`, changed in place and returned.
 
-    Steps are halved by damping until they gain; a coordinate that would leave its limits stays there and the others are
-    solved again. Stops where a step gains less than `tolerance` [nats].
+    Steps are shortened by damping until they gain; a coordinate that would leave its limits stays there and the others
+    are solved again. A likelihood in a delay has creases, where commands arrive with a row: on one, no step gains, and
+    delays are held. Stops where a step gains less than `tolerance` [nats].
     """
     names = h.free if names is None else list(names)
     at = [INDEX[n] for n in names]
@@ -175,6 +176,9 @@ def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05, names: Sequ
     low, high = np.concatenate([low, -boundless]), np.concatenate([high, boundless])
     h.evaluate()
     current, damping = h.log_likelihood + penalty(h, names), 1e-3
+    creased = np.array([n.endswith("_delay") or n == "dead_time" for n in names])
+    creased = np.concatenate([creased, boundless < 0])
+    held = np.zeros(len(creased), bool)
     for _ in range(iterations):
         slopes, precision, pull = linearised(h, names)
         W = whitened_under_noise(h, slopes, precision, 1)
@@ -182,10 +186,10 @@ def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05, names: Sequ
         current = h.log_likelihood + penalty(h, names)
         g = W @ whiten(h.data, h.covariance, h.residual) + pull
         better = None
-        for _ in range(5):
+        for _ in range(10):
             A = H + np.diag(precision + damping * np.diag(H) + 1e-12)
             new = h.copy()
-            x = _within(A, g, np.concatenate([h.values[at], h.force_coefficients]), low, high)
+            x = _within(A, g, np.concatenate([h.values[at], h.force_coefficients]), low, high, held)
             new.values[at], new.force_coefficients = x[: len(at)], x[len(at) :]
             new["T_L"] = min(max(new["T_L"], 0.4 * h["T_L"]), 2.5 * h["T_L"])
             new.evaluate()
@@ -193,7 +197,12 @@ def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05, names: Sequ
             if value > current - 1e-9:
                 better = new
                 break
-            damping = max(damping * 8, 1e-2)
+            if damping > 10.0:
+                if held.any() or not creased.any():
+                    break
+                held, damping = creased, 1e-3
+            else:
+                damping = max(damping * 8, 1e-2)
         if better is None:
             break
         gain, current = value - current, value
@@ -206,16 +215,19 @@ def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05, names: Sequ
     return h
 
 
-def _within(A: FloatArray, g: FloatArray, x: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """`x` plus the step that solves `A step = g`, within limits: what would leave them is fixed, the rest solved
-    again."""
+def _within(
+    A: FloatArray, g: FloatArray, x: FloatArray, low: FloatArray, high: FloatArray, held: BoolArray
+) -> FloatArray:
+    """`x` plus the step that solves `A step = g`, within limits and not along `held` coordinates: what would leave its
+    limits is fixed, the rest solved again."""
     step = np.linalg.solve(A, g)
     fixed = np.zeros(len(x), bool)
-    for _ in range(3):
-        beyond = ((x + step < low) | (x + step > high)) & ~fixed
+    for _ in range(4):
+        beyond = ((x + step < low) | (x + step > high) | held) & ~fixed
         if not beyond.any():
             break
         fixed |= beyond
+        step[held] = 0.0
         step[beyond] = np.clip(x[beyond] + step[beyond], low[beyond], high[beyond]) - x[beyond]
         free = ~fixed
         if free.any():

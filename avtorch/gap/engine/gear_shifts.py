@@ -272,7 +272,9 @@ class _PulseLikelihood:
 
     def pulses(self, times: FloatArray, duration: float) -> _Pulses:
         """Of upshifts at `times` (upshift,) [s]; the plant's interruption begins a step of its grid later."""
-        first, values = _pulses(self.data.time, self.data.starts, self.demand, times + self._delay, duration)
+        begins = times + self._delay
+        first = np.searchsorted(self.data.time, begins, side="right") - 1
+        values = _pulses(self.data.time, self.data.starts, self.demand, begins, first, duration)
         return _Pulses(first, values)
 
     @property
@@ -389,7 +391,7 @@ class _Shifts:
         return best[0]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def upshift_times(  # pragma: no cover - compiled
     time: FloatArray, speed: FloatArray, starts: BoolArray, level: float, hysteresis: float
 ) -> FloatArray:
@@ -412,7 +414,7 @@ def upshift_times(  # pragma: no cover - compiled
     return out[:count].copy()
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def dips_below(  # pragma: no cover - compiled
     speed: FloatArray, starts: BoolArray, level: float
 ) -> FloatArray:
@@ -434,14 +436,13 @@ def dips_below(  # pragma: no cover - compiled
     return out[:count].copy()
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _pulses(  # pragma: no cover - compiled
-    time: FloatArray, starts: BoolArray, demand: FloatArray, begins: FloatArray, duration: float
-) -> tuple[IntArray, FloatArray]:
-    """First rows (upshift,) and the lost demand (upshift, row): `demand` times the share of each step that lies within
-    `duration` of `begins`. None reaches into another stretch."""
+    time: FloatArray, starts: BoolArray, demand: FloatArray, begins: FloatArray, first: IntArray, duration: float
+) -> FloatArray:
+    """The lost demand (upshift, row) from `first` rows (upshift,) on: `demand` times the share of each step that lies
+    within `duration` of `begins`. None reaches into another stretch."""
     n = len(time)
-    first = np.searchsorted(time, begins, side="right") - 1
     most = 1
     for e in range(len(begins)):
         k = first[e]
@@ -459,10 +460,10 @@ def _pulses(  # pragma: no cover - compiled
             if share <= 0.0:
                 break
             values[e, j] = demand[k] * share
-    return first, values
+    return values
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _dots(rows: FloatArray, first: IntArray, values: FloatArray) -> FloatArray:  # pragma: no cover - compiled
     """Inner products (signal,) of signals `rows` (signal, row) with all pulses."""
     out = np.zeros(len(rows))
@@ -475,7 +476,7 @@ def _dots(rows: FloatArray, first: IntArray, values: FloatArray) -> FloatArray: 
     return out
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _energy(  # pragma: no cover - compiled
     first: IntArray, values: FloatArray, information: FloatArray, cover: FloatArray
 ) -> float:
@@ -502,7 +503,7 @@ def _energy(  # pragma: no cover - compiled
     return float(total)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _take_out_all(  # pragma: no cover - compiled
     score: FloatArray, information: FloatArray, cover: FloatArray, first: IntArray, values: FloatArray, sign: float
 ) -> None:

@@ -194,7 +194,7 @@ class Hypothesis:
     ) -> tuple[FloatArray, FloatArray]:
         """The accelerometer's reading [m/s²] and the speed gained in its stretch [m/s] on the grid, (grid,) each."""
         p = self.values if values is None else values
-        data, grid = self.data, self.data.grid
+        grid = self.data.grid
         if self.baseline is not None or any(EFFECTS[e].kind is not None for e in self.effects):
             return simulator_signals(self, p, onsets)
         accel, gained = np.empty(len(grid.time)), np.empty(len(grid.time))
@@ -208,8 +208,6 @@ class Hypothesis:
             grid.accel0,
             self.shift_speeds,
             self.reference_speed,
-            float(data.time[0]),
-            max(float(data.time[-1] - data.time[0]), 1.0),
             accel,
             gained,
         )

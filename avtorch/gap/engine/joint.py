@@ -30,9 +30,9 @@ from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.free_forms import COEFFICIENT_SD, demand_response, families
 from avtorch.gap.engine.gauss_newton import jacobian, normal_prior
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import claimed, whiten
+from avtorch.gap.engine.likelihood import claim_bands, claimed, whiten
 from avtorch.gap.engine.outliers import sensor_outliers, without_outliers
-from avtorch.gap.engine.priors import CLAIM_HZ, ONE_CHANNEL_HZ
+from avtorch.gap.engine.priors import ONE_CHANNEL_HZ
 from avtorch.gap.engine.recorder import aligned, base_fit
 from avtorch.gap.simulator.plant import GapPlant
 
@@ -49,7 +49,7 @@ NOISE_COUNTS = 4.0
 SIZES = (0.03, 0.1, COEFFICIENT_SD)
 """Prior standard deviations of free forms' coefficients, of which the likeliest stands [of the demand]."""
 _BLOCK_S, _FEWEST_BLOCKS = 10.0, 5
-NO_CHANGE = frozenset({"gain_change", "gain_change/drift", "gear_shift", "command_hold", "dead_time", "~linear"})
+NO_CHANGE = frozenset({"gain_change", "gear_shift", "command_hold", "dead_time", "~linear"})
 """What is no change of a car between drives: of one drive, of chance, or a change of T_L, K_L and dead time."""
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 
@@ -338,7 +338,7 @@ class JointModel:
             noise = [noise_left(P, left, h.data, k) for P, h, k in zip(sums, sides, self.known, strict=True)]
         nats, low = (
             sum(nats_of(h.data, n, k, fmax) for h, n, k in zip(sides, noise, self.known, strict=True))
-            for fmax in (math.inf, CLAIM_HZ)
+            for fmax in (math.inf, None)
         )
         mean, precision = self._prior(coordinates)
         objective = nats - 0.5 * float(precision @ (x - mean) ** 2) - 0.5 * self.sd**-2 * float(c @ c)
@@ -552,12 +552,12 @@ def noise_left(products: FloatArray, left: FloatArray, data: DriveData, known: F
     return S + (_LEAST * trace)[:, None, None] * np.eye(data.channel_count)
 
 
-def nats_of(data: DriveData, noise: FloatArray, known: FloatArray | None, fmax: float = math.inf) -> float:
+def nats_of(data: DriveData, noise: FloatArray, known: FloatArray | None, fmax: float | None = math.inf) -> float:
     """Nats of the bands that begin below `fmax` [Hz], the noise integrated out under its prior."""
     nats = claimed(data, noise, fmax)
     if known is None:
         return nats
-    n = max(int(np.searchsorted(data.frequency[data.band_edges[:-1]], fmax)), 1)
+    n = claim_bands(data, fmax)
     return nats - 0.5 * NOISE_COUNTS * float(np.linalg.slogdet(noise[:n])[1].sum())
 
 

@@ -18,7 +18,6 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.priors import CLAIM_HZ
 
 _LEAST = 1e-9  # of a covariance's trace: what no channel's rounding goes below
 
@@ -54,10 +53,16 @@ def freedom(data: DriveData, covariance: FloatArray, spread: FloatArray) -> floa
     return float((data.band_size * np.einsum("bij,bji->b", np.linalg.inv(covariance), spread)).sum())
 
 
-def claimed(data: DriveData, covariance: FloatArray, fmax: float = CLAIM_HZ) -> float:
-    """Nats of the bands that begin below `fmax` [Hz], in which cars move."""
-    n = max(int(np.searchsorted(data.frequency[data.band_edges[:-1]], fmax)), 1)
+def claimed(data: DriveData, covariance: FloatArray, fmax: float | None = None) -> float:
+    """Nats of the bands that begin below `fmax` [Hz], by default `claim_hz`, in which cars move."""
+    n = claim_bands(data, fmax)
     return float(-0.5 * (data.band_size[:n] * np.linalg.slogdet(covariance[:n])[1]).sum())
+
+
+def claim_bands(data: DriveData, fmax: float | None = None) -> int:
+    """Number of bands that begin below `fmax` [Hz], by default `claim_hz`, at least one."""
+    below = data.claim_hz if fmax is None else fmax
+    return max(int(np.searchsorted(data.frequency[data.band_edges[:-1]], below)), 1)
 
 
 def whiten(data: DriveData, covariance: FloatArray, x: FloatArray) -> FloatArray:

@@ -16,10 +16,11 @@ The residual with its sign turned around is a negative control: noise gains as m
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.gap.engine.demand_filter import (
@@ -166,18 +167,18 @@ def schedule(first: IntArray, stop: IntArray, value: FloatArray, apart: int) -> 
     Candidate k occupies rows `first[k]` to `stop[k]` - 1; between two chosen ones lie at least `apart` rows.
     """
     order = np.argsort(stop, kind="stable")
-    chosen = _schedule(first[order], stop[order], value[order], apart)
-    return order[chosen]
+    before = np.searchsorted(stop[order], first[order] - apart, side="right")
+    return order[_schedule(before, value[order])[::-1]]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _schedule(  # pragma: no cover - compiled
-    first: IntArray, stop: IntArray, value: FloatArray, apart: int
+    before: IntArray, value: FloatArray
 ) -> IntArray:
-    """`schedule` of candidates sorted by `stop`."""
-    n = len(first)
+    """`schedule` of candidates in order, `before` (candidate,) each of which so many may be chosen, too; the last
+    first."""
+    n = len(before)
     best = np.zeros(n + 1)
-    before = np.searchsorted(stop, first - apart, side="right")
     for k in range(n):
         best[k + 1] = max(best[k], value[k] + best[before[k]])
     out = np.empty(n, np.int64)
@@ -189,11 +190,11 @@ def _schedule(  # pragma: no cover - compiled
             k = before[k - 1]
         else:
             k -= 1
-    return out[:count][::-1].copy()
+    return out[:count]
 
 
 # one stretch ---------------------------------------------------------------------------------------------------------
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _free_until(blocked: BoolArray) -> IntArray:  # pragma: no cover - compiled
     """First blocked row from each row on (row,)."""
     n = len(blocked)
@@ -206,7 +207,7 @@ def _free_until(blocked: BoolArray) -> IntArray:  # pragma: no cover - compiled
     return out
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _gains(  # pragma: no cover - compiled
     m: PulseModel, score: FloatArray, backwards: FloatArray, first: int, most: int, pulse: FloatArray, out: FloatArray
 ) -> int:
@@ -236,7 +237,16 @@ def _gains(  # pragma: no cover - compiled
     return last
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
+def _longer(x: NDArray[Any]) -> NDArray[Any]:  # pragma: no cover - compiled
+    """`x` (element,) and as many free places. A loop: what numba has for it takes seconds to compile."""
+    out = np.empty(2 * len(x), x.dtype)
+    for k in range(len(x)):
+        out[k] = x[k]
+    return out
+
+
+@njit(cache=True, error_model="numpy")
 def candidates(  # pragma: no cover - compiled
     m: PulseModel, score: FloatArray, begin: int, end: int
 ) -> tuple[IntArray, IntArray, FloatArray]:
@@ -246,8 +256,8 @@ def candidates(  # pragma: no cover - compiled
     those that begin in one row, a longer one counts only if it gains more than each shorter one.
     """
     out, pulse, backwards = np.empty(m.longest), np.empty(m.longest), m.information[::-1].copy()
-    size, count = 256, 0
-    first, stop, gain = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size)
+    count = 0
+    first, stop, gain = np.empty(256, np.int64), np.empty(256, np.int64), np.empty(256)
     for i in range(max(begin, 1), end):
         most = min(m.longest, end - i, m.free[i] - m.tail - i)
         if most <= 0 or m.demand[i] == m.demand[i - 1]:
@@ -256,16 +266,14 @@ def candidates(  # pragma: no cover - compiled
         for k in range(_gains(m, score, backwards, i, most, pulse, out)):
             if out[k] > best:
                 best = out[k]
-                if count == size:
-                    size *= 2
-                    first, stop = np.append(first, np.empty_like(first)), np.append(stop, np.empty_like(stop))
-                    gain = np.append(gain, np.empty_like(gain))
+                if count == len(gain):
+                    first, stop, gain = _longer(first), _longer(stop), _longer(gain)
                 first[count], stop[count], gain[count] = i, i + k + 1, best
                 count += 1
     return first[:count], stop[:count], gain[:count]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _best_within(  # pragma: no cover - compiled
     m: PulseModel, score: FloatArray, begin: int, end: int
 ) -> tuple[int, int]:
@@ -277,15 +285,18 @@ def _best_within(  # pragma: no cover - compiled
     return first[k], stop[k]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _put(  # pragma: no cover - compiled
     m: PulseModel, score: FloatArray, i: int, j: int, sign: float
 ) -> None:
     """`score` beside the stretch from row `i` to `j` - 1 (`sign` -1: without it), in place."""
-    take_out(score, m.information, m.cover, m.demand[i - 1] - m.demand[i:j], i, sign)
+    pulse = np.empty(j - i)
+    for k in range(i, j):
+        pulse[k - i] = m.demand[i - 1] - m.demand[k]
+    take_out(score, m.information, m.cover, pulse, i, sign)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _conditional_modes(  # pragma: no cover - compiled
     m: PulseModel, score: FloatArray, begin: IntArray, end: IntArray, count: int, sweeps: int
 ) -> int:
@@ -311,9 +322,9 @@ def _conditional_modes(  # pragma: no cover - compiled
                 changed = changed or a != i or b != j
                 k += 1
             else:
-                begin[k : count - 1] = begin[k + 1 : count].copy()
-                end[k : count - 1] = end[k + 1 : count].copy()
                 count -= 1
+                for later in range(k, count):
+                    begin[later], end[later] = begin[later + 1], end[later + 1]
                 changed = True
         k = 0
         while k <= count:  # what the others leave
@@ -322,8 +333,8 @@ def _conditional_modes(  # pragma: no cover - compiled
             a, b = _best_within(m, score, low, high)
             if b > 0:
                 _put(m, score, a, b, 1.0)
-                begin[k + 1 : count + 1] = begin[k:count].copy()
-                end[k + 1 : count + 1] = end[k:count].copy()
+                for later in range(count, k, -1):
+                    begin[later], end[later] = begin[later - 1], end[later - 1]
                 begin[k], end[k] = a, b
                 count += 1
                 changed = True

@@ -253,7 +253,7 @@ def _lasting(z: FloatArray, longest: float) -> BoolArray:
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _sum_log1p(x: FloatArray, factor: FloatArray) -> FloatArray:
     """Sums of log(1 + factor x) over x (value,) >= 0, of the shape of `factor`: products, of which one log is taken."""
     out = np.zeros(factor.shape)
@@ -269,7 +269,7 @@ def _sum_log1p(x: FloatArray, factor: FloatArray) -> FloatArray:
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _sum_log1p_exp(x: FloatArray, a: FloatArray, b: FloatArray, odds: FloatArray) -> FloatArray:
     """Sums of log(1 + odds b exp(a x)) over x (value,) >= 0: (law, odds), `a` and `b` (law,)."""
     out, product = np.zeros((len(a), len(odds))), np.empty(len(odds))

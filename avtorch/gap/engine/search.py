@@ -8,6 +8,7 @@ turn. The answer is not the last set but the average of all visited ones (`avera
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -30,6 +31,7 @@ _MOST_FITS, _FEWEST_FITS = 160, 40  # of a search; a hard case of five minutes t
 _GRID_FITS = 4e6  # fits times grid points: what a long drive may cost
 _WIDTH, _LATER_WIDTH = 9, 6  # effects fitted from the base, and from a set
 _FINISHED = 3  # of these, how many are finished
+_RAMPS = 10  # of a gain that changes, from a second to the drive's length
 _CUTS = 12  # onsets at which a response's size is computed; between them it is interpolated
 _MARGIN_S = 8.0  # no onset this near to an end of the drive
 _LEAST_PROMISE = 1.5  # nats: less is the gain of a parameter that does nothing
@@ -245,6 +247,8 @@ class Search:
         if "gear_shift" in h.effects and not self._shifts_refined:
             h = refined_shift_speeds(h)
             self._shifts_refined = True
+        if "gain_change" in h.effects:
+            h = other_ramp(h)
         for e in list(h.onsets):
             h = refined_onset(h, e)
         return h
@@ -405,7 +409,8 @@ def _onsets(
     whitened: FloatArray,
     steps: FloatArray,
 ) -> list[Promise]:
-    """The two best onsets: the residual's adjoint prices all rows at once, then the response is computed."""
+    """The two best onsets, and those of effects that are in: the residual's adjoint prices all rows at once, then the
+    response is computed."""
     data = h.data
     cuts = np.unique(np.round(np.linspace(0.12, 0.88, _CUTS) * data.frame_count).astype(int))
     cuts = cuts[(cuts > 0) & (cuts < data.frame_count)]
@@ -423,21 +428,24 @@ def _onsets(
     size = np.maximum(size, 0.15 * max(sizes))
     inside = (data.time > data.time[0] + _MARGIN_S) & (data.time < data.time[-1] - _MARGIN_S)
     priced = np.where(inside & ((gains > 0) | (not e.one_sided)), 0.5 * gains**2 / (size + 1), 0.0)
-    out = []
+    tried = [(onset, 0.0) for onset in sorted(set(h.onsets.values()))]
     for _ in range(2):
         row = int(priced.argmax())
         if priced[row] <= 0:
             break
-        onset = float(data.time[row])
+        tried.append((float(data.time[row]), 3.0))
+        priced[np.abs(data.time - data.time[row]) < data.hop_s] = 0
+    out = []
+    for onset, price in tried:
         acts = h.onset_vector()
         for c in e.coordinates:
             acts[INDEX[c.name]] = onset
         free = projection(whiten(data, h.covariance, h.response(values, acts) - h.predicted))
         n, gain = float(free @ free), float(free @ projection.residual)
         if n > 1e-9 and (gain > 0 or not e.one_sided):
-            scaled = tuple(x * float(np.clip(gain / n, -4, 4)) for x in start) if len(start) == 1 else start
-            out.append(Promise(projection.nats(free) - 3.0, e.name, scaled, onset))
-        priced[np.abs(data.time - onset) < data.hop_s] = 0
+            share = float(np.clip(gain / n, -4, 4)) if len(start) == 1 or e.onset == "must" else 1.0
+            scaled = (share * start[0], *start[1:])
+            out.append(Promise(projection.nats(free) - price, e.name, scaled, onset))
     return out
 
 
@@ -485,9 +493,28 @@ def other_limit(h: Hypothesis) -> Hypothesis:
     return best
 
 
-def refined_onset(h: Hypothesis, effect: str) -> Hypothesis:
-    """The hypothesis with the onset of one effect refined: frames tell it roughly, what sets in at once sharply."""
+def other_ramp(h: Hypothesis) -> Hypothesis:
+    """The gain's change over another time: a step found it, at the middle of what may last as long as the drive."""
     data = h.data
+    first, last = float(data.time[0]), float(data.time[-1])
+    ramp = math.exp(h["gain_ramp"])
+    middle = h.onsets["gain_change"] + 0.5 * ramp
+    tried = []
+    for longer in np.geomspace(1.0, max(last - first, 2.0), _RAMPS):
+        for at in (middle, middle - 0.25 * longer, middle + 0.25 * longer):
+            new = h.copy()
+            new["gain_ramp"] = math.log(longer)
+            new.onsets["gain_change"] = min(max(at - 0.5 * longer, first), last)
+            tried.append(new.evaluate())
+    best = max(tried, key=objective)
+    return max(h, fit(best, 6), key=objective)
+
+
+def refined_onset(h: Hypothesis, effect: str) -> Hypothesis:
+    """The hypothesis with the onset of one effect refined, and of those that set in with it: frames tell it roughly,
+    what sets in at once sharply."""
+    data = h.data
+    together = [e for e, onset in h.onsets.items() if onset == h.onsets[effect]]
     first, last = float(data.time[0]) + 5, float(data.time[-1]) - 5
     begun = h.onsets[effect]
     best = h
@@ -496,7 +523,7 @@ def refined_onset(h: Hypothesis, effect: str) -> Hypothesis:
         if not first < onset < last:
             return None
         new = of.copy()
-        new.onsets[effect] = onset
+        new.onsets |= dict.fromkeys(together, onset)
         new.evaluate()
         return new if new.log_likelihood > best.log_likelihood + 0.05 else None
 

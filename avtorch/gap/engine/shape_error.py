@@ -31,7 +31,8 @@ from numba import njit
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.priors import CLAIM_HZ, SHAPE_ERROR, SHAPE_ERROR_FOUND, TEMPER
+from avtorch.gap.engine.likelihood import claim_bands
+from avtorch.gap.engine.priors import SHAPE_ERROR, SHAPE_ERROR_FOUND, TEMPER
 
 RELATIVE_ERRORS = (0.0, 0.015, 0.03, 0.06, 0.12, 0.24)
 """Relative errors of a response [-] at which the likelihood is evaluated: doublings around `SHAPE_ERROR`."""
@@ -41,7 +42,7 @@ _FOUND_ONE_BY_ONE = "command_hold"
 
 
 class ShapeLikelihood(NamedTuple):
-    """What the relative errors of a grid leave of a residual, in the bands below `CLAIM_HZ`.
+    """What the relative errors of a grid leave of a residual, in the bands below `claim_hz`.
 
     `nats` (error,): log likelihood over that of an exact shape; `covariances` (error, band, channel, channel): of the
     noise, per coefficient; `counts` (error, band): effective number of coefficients per channel that measured it.
@@ -93,7 +94,7 @@ def relative_size(data: DriveData, covariance: FloatArray, companion: FloatArray
     """Relative amplitude of a companion's response (channel, frame, bin) over effects of an energy, where it acts.
 
     Both are measured in units of the noise, `covariance` (band, channel, channel); the mean of the logarithm of the
-    ratio over frames and bands below `CLAIM_HZ` is weighted by the companion's own information. `energy`: of
+    ratio over frames and bands below `claim_hz` is weighted by the companion's own information. `energy`: of
     `effect_energy`.
     """
     bands = claim_bands(data)
@@ -109,7 +110,7 @@ def shape_likelihood(
     residual: FloatArray,
     energy: FloatArray | None,
     iterations: int = 30,
-    fmax: float = CLAIM_HZ,
+    fmax: float | None = None,
 ) -> ShapeLikelihood | None:
     """Likelihood of each of `RELATIVE_ERRORS` in the effects behind a residual (channel, frame, bin).
 
@@ -144,11 +145,6 @@ def shape_log_odds(relative: float, gain: float, effects: Iterable[str], temper:
     return min(log_density_at_zero / temper, max(gain, 0.0)) - 0.5 * (relative / scale) ** 2 / temper
 
 
-def claim_bands(data: DriveData, fmax: float = CLAIM_HZ) -> int:
-    """Number of bands that begin below `fmax` [Hz], at least one."""
-    return max(int(np.searchsorted(data.frequency[data.band_edges[:-1]], fmax)), 1)
-
-
 def _packed(energy: FloatArray, alone: float) -> FloatArray:
     """Elements 00, 01, 11 of covariances (frame, band, channel, channel); a lone channel's partner is `alone`."""
     packed = np.zeros((*energy.shape[:2], 3))
@@ -158,7 +154,7 @@ def _packed(energy: FloatArray, alone: float) -> FloatArray:
     return packed
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _noise_beside(  # pragma: no cover - compiled
     observed: FloatArray, energy: FloatArray, sizes: FloatArray, errors: FloatArray, channels: int, iterations: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -209,12 +205,12 @@ def _noise_beside(  # pragma: no cover - compiled
                     g0, g1, g2 = _geometric_mean(a2 / det, -a1 / det, a0 / det, b0, b1, b2)
                     s0, s1, s2 = _proper(g0, g1, g2, least0, least2)
             nats[e, band] = value
-            covariances[e, band] = (s0, s1, s2)
+            covariances[e, band, 0], covariances[e, band, 1], covariances[e, band, 2] = s0, s1, s2
             counts[e, band] = effective
     return nats, covariances, counts
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _proper(  # pragma: no cover - compiled
     s0: float, s1: float, s2: float, least0: float, least2: float
 ) -> tuple[float, float, float]:
@@ -224,7 +220,7 @@ def _proper(  # pragma: no cover - compiled
     return s0, min(max(s1, -limit), limit), s2
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _geometric_mean(  # pragma: no cover - compiled
     p0: float, p1: float, p2: float, q0: float, q1: float, q2: float
 ) -> tuple[float, float, float]:

@@ -49,6 +49,7 @@ ROAD_LENGTH_M = (450.0, 0.6)
 
 # grids: wide enough for three standard deviations of the priors, ratios of 1.3 to 1.5
 PROCESS_NOISE_GRID = np.geomspace(0.004, 0.6, 20)
+_GRID_RATIO = float(PROCESS_NOISE_GRID[1] / PROCESS_NOISE_GRID[0])
 PROCESS_NOISE_STEPS = (0, 2, 4, 7, 10)
 """Steps of its grid by which process noise may be smaller beside a gust or a road than alone."""
 SIZE_GRID_MPS2 = np.geomspace(0.02, 0.8, 16)
@@ -197,7 +198,7 @@ def wishart_profile(covariance: FloatArray, counts: FloatArray, power: FloatArra
     return nats.reshape(power.shape), variances.reshape(*power.shape, 2)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _profile(covariance: FloatArray, counts: FloatArray, power: FloatArray) -> tuple[FloatArray, FloatArray]:
     nats, variances = np.empty(power.shape), np.empty((*power.shape, 2))
     for b in range(power.shape[1]):
@@ -232,7 +233,7 @@ def _profile(covariance: FloatArray, counts: FloatArray, power: FloatArray) -> t
     return nats, variances
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _root(p: float, r: float, k: float) -> float:
     """Root of k³ - k² + (2 p r - p²) k - p² by Newton's method from `k`.
 
@@ -255,7 +256,7 @@ def _root(p: float, r: float, k: float) -> float:
     return k
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _cost(s00: float, s11: float, s01: float, P: float, a: float, c: float) -> float:
     """log det V + tr V^-1 S."""
     determinant = a * c + P * (a + c)
@@ -302,14 +303,19 @@ def slow_forces(
         return _one_channel(data, covariance[:, 0, 0], counts, power).sum(-1)
 
     lags = np.atleast_1d(values[INDEX["T_L"]] if lags is None else lags)
-    unit = process_spectrum(frequency, lags, values[INDEX["square_period"]]) @ energy.T
+    spectra = process_spectrum(frequency, lags)
+    if values[INDEX["square_period"]] > 0:  # a second pole is passed by what disturbs the actuator, not the body
+        spectra = np.concatenate([spectra, process_spectrum(frequency, lags, values[INDEX["square_period"]])])
+    unit = spectra @ energy.T
     process = PROCESS_NOISE_GRID[:, None] ** 2 * unit[:, None]  # (lag, size, band)
-    prior = _log_normal(PROCESS_NOISE_GRID, PROCESS_NOISE)
-    alone = nats(process) + prior
+    alone = nats(process) + _log_normal(PROCESS_NOISE_GRID, PROCESS_NOISE)
     lag, most = np.unravel_index(np.argmax(alone), alone.shape)
-    base = float(alone[lag, most])
-    smaller = np.unique(np.clip(most - np.array(PROCESS_NOISE_STEPS), 0, None))
-    process, prior = process[lag, smaller], prior[smaller]
+    # long drives know the size better than the grid: what is between its points would pass for a gust
+    fine = PROCESS_NOISE_GRID[most] * np.geomspace(1 / _GRID_RATIO, _GRID_RATIO, 13)
+    alone = nats(fine[:, None] ** 2 * unit[lag]) + _log_normal(fine, PROCESS_NOISE)
+    base, size = float(alone.max()), float(fine[np.argmax(alone)])
+    sizes = size / _GRID_RATIO ** np.array(PROCESS_NOISE_STEPS)
+    process, prior = sizes[:, None] ** 2 * unit[lag], _log_normal(sizes, PROCESS_NOISE)
 
     def best(unit: FloatArray, sizes: tuple[float, float], shape_prior: FloatArray) -> tuple[float, tuple[int, ...]]:
         """Most nats over process noise alone, and where: of process noise, of the size, of the spectrum's shape."""
@@ -327,7 +333,7 @@ def slow_forces(
     return SlowForces(
         log_likelihood=base,
         bands=bands,
-        process_noise=float(PROCESS_NOISE_GRID[most]),
+        process_noise=size,
         gust=gust,
         gust_sd=float(SIZE_GRID_MPS2[g1]),
         gust_time=float(GUST_TIME_GRID_S[g2]),

@@ -69,8 +69,12 @@ class TorchRecorder:
         return _read(x, *_between(self.grid_time, self.time - delay[..., None]))
 
     def _low_pass(self, x: Tensor, time_constant: Tensor) -> Tensor:
-        c = time_constant / (time_constant + self.data.dt)
-        return cast(Tensor, _OnePole.apply(x, torch.where(time_constant < 1e-4, 0.0, c), self.data))
+        tau = time_constant.clamp_min(1e-4)
+        keep = torch.exp(-self.data.dt / tau)
+        held = tau / self.data.dt * (1 - keep)
+        none = time_constant < 1e-4
+        pole = [torch.where(none, x, y) for x, y in ((0.0, keep), (1.0, 1 - held), (0.0, held - keep))]
+        return cast(Tensor, _OnePole.apply(x, *pole, self.data))
 
 
 def _between(time: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
@@ -88,30 +92,31 @@ def _read(x: Tensor, index: Tensor, share: Tensor) -> Tensor:
 
 
 class _OnePole(torch.autograd.Function):
-    """y[k] = c y[k-1] + (1 - c) x[k], from y = x at the start of a stretch on; x (column, row), c (column,)."""
+    """`drive_data.one_pole`, from y = x at the start of a stretch on; x (column, row), coefficients (column,)."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, c: Tensor, data: DriveData) -> Tensor:
-        rows, keep = x.detach().numpy(), c.detach().numpy()
+    def forward(ctx: Any, x: Tensor, keep: Tensor, new: Tensor, old: Tensor, data: DriveData) -> Tensor:
+        rows, pole = x.detach().numpy(), [c.detach().numpy() for c in (keep, new, old)]
         y = np.empty_like(rows)
-        for column, own in enumerate(keep):
+        for column, (k, n, o) in enumerate(zip(*pole, strict=True)):
             for i, j in pairwise(data.bounds):
-                head = rows[column, i]
-                y[column, i:j] = lfilter([1 - own], [1, -own], rows[column, i:j], zi=[own * head])[0]
-        ctx.x, ctx.y, ctx.keep, ctx.data = rows, y, keep, data
+                y[column, i:j] = lfilter([n, o], [1, -k], rows[column, i:j], zi=[(1 - n) * rows[column, i]])[0]
+        ctx.x, ctx.y, ctx.pole, ctx.data = rows, y, pole, data
         return torch.as_tensor(y)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        g, on_x, on_c = gradient.numpy(), np.empty_like(ctx.x), np.zeros(len(ctx.keep))
-        for column, own in enumerate(ctx.keep):
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        g, on_x, on_pole = gradient.numpy(), np.empty_like(ctx.x), np.zeros((3, len(ctx.x)))
+        for column, (k, n, o) in enumerate(zip(*ctx.pole, strict=True)):
             for i, j in pairwise(ctx.data.bounds):
-                costate = lfilter([1.0], [1, -own], g[column, i:j][::-1])[::-1]
-                on_x[column, i:j] = (1 - own) * costate
+                costate = lfilter([1.0], [1, -k], g[column, i:j][::-1])[::-1]
+                x, y, later = ctx.x[column, i:j], ctx.y[column, i:j], costate[1:]
+                on_x[column, i:j] = n * costate
                 on_x[column, i] = costate[0]
-                on_c[column] += costate[1:] @ (ctx.y[column, i : j - 1] - ctx.x[column, i + 1 : j])
-        return torch.as_tensor(on_x), torch.as_tensor(on_c), None
+                on_x[column, i : j - 1] += o * later
+                on_pole[:, column] += later @ y[:-1], later @ x[1:], later @ x[:-1]
+        return torch.as_tensor(on_x), *torch.as_tensor(on_pole), None
 
 
 class _Transform(torch.autograd.Function):

@@ -17,7 +17,7 @@ from avtorch import diagnose
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest.drives import Recorded
 from avtorch.errors import InputError
-from avtorch.gap import DeadTime, SensorBias
+from avtorch.gap import DeadTime, GainChange, SensorBias
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.inference import infer
 from avtorch.gap.result.diagnosis import Diagnosis
@@ -66,6 +66,13 @@ def test_an_effect_is_found_with_its_size(effect: Effect, key: str, rotating_see
     found = found_in(recorded_log([effect], seed=rotating_seed), FEW)
     says(found, effect.name, {key: getattr(effect, key)})
     assert found.onset_s is None
+
+
+@pytest.mark.statistical
+def test_a_gain_that_fades_is_one_change(rotating_seed: int) -> None:
+    fading = GainChange(gain_ratio=0.65, change_s=40.0, ramp_s=30.0, latest_s=120.0)
+    found = found_in(recorded_log([fading], seconds=120.0, seed=rotating_seed), [*FEW, "gain_change"])
+    says(found, "gain_change", {"gain_ratio": 0.65})
 
 
 @pytest.mark.slow

@@ -11,11 +11,11 @@ import pytest
 from avtorch import Log
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.priors import CLAIM_HZ, SHAPE_ERROR, TEMPER
+from avtorch.gap.engine.likelihood import claim_bands
+from avtorch.gap.engine.priors import SHAPE_ERROR, TEMPER
 from avtorch.gap.engine.shape_error import (
     RELATIVE_ERRORS,
     _geometric_mean,
-    claim_bands,
     effect_energy,
     frame_energy,
     log_prior,
@@ -156,8 +156,8 @@ def test_without_an_effect_no_shape_is_wrong() -> None:
 
 def test_bands_above_the_claim_do_not_count() -> None:
     data = _data()
-    assert data.frequency[data.band_edges[claim_bands(data) - 1]] <= CLAIM_HZ
-    assert data.frequency[data.band_edges[claim_bands(data)]] > CLAIM_HZ
+    assert data.frequency[data.band_edges[claim_bands(data) - 1]] <= data.claim_hz
+    assert data.frequency[data.band_edges[claim_bands(data)]] > data.claim_hz
 
 
 @both
