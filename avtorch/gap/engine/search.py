@@ -102,7 +102,7 @@ class Search:
         and not be far behind them. Where it does not, nothing changes. With one channel nothing tells a map from the
         base's own unnamed dynamics: there names stand alone.
         """
-        if self._ended() or self.base.data.channel_count == 1:
+        if self.base.data.channel_count == 1 or (self.stop is not None and self.stop()):
             return best
         more = best.score - self.base.score
         alone, beside = prices(self.base), prices(best) if more > 0 else []
@@ -110,12 +110,13 @@ class Search:
         wanted |= {p.form.name: p.nats - more for p in alone if p.gains and p.form.name not in wanted}
         least = max([0.0, *wanted.values()]) - WITHIN_NATS
         bases = [with_force_map(self.base, p.form) for p in alone if wanted.get(p.form.name, -np.inf) > least]
-        for base in bases:
+        best_base = max((h.score for h in bases), default=0.0)
+        self.map_bases = [h for h in bases if h.score > best_base - WITHIN_NATS]
+        for base in self.map_bases:
             self._put(base)
             self.fits = self.most_fits // 2  # sets in front of a map begin where those without one ended
             found = self._with_map_of(best, base)
             best = max(best, self.extended(found, another_way=False), key=lambda h: h.score)
-        self.map_bases = bases
         return best
 
     def _with_map_of(self, h: Hypothesis, base: Hypothesis) -> Hypothesis:
