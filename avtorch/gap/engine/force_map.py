@@ -24,6 +24,10 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.priors import FAINT_MAP, MAP_SIZE
 
+RESISTANCES = ("aerodynamic_drag", "constant_resistance", "low_speed_creep")
+"""Effects that are a curve over the speed."""
+CURVES = (*RESISTANCES, "dead_band", "saturation", "brake_throttle_asymmetry", "speed_dependent_gain")
+"""Effects that are a map, or make another map of one: beside a map they have no name of their own."""
 MAP_SIZES = np.geomspace(FAINT_MAP, 32 * FAINT_MAP, 6)
 """Relative sizes z that are tried [-]: doublings."""
 _U_QUANTILES = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)  # of what was driven; the outer knots at its ends
@@ -71,6 +75,11 @@ class MapForm:
     scale: float
     size: float = MAP_SIZE[0]
     size_nats: float = 0.0
+
+    @property
+    def takes_up(self) -> tuple[str, ...]:
+        """Effects that are among its curves."""
+        return RESISTANCES if self.name == "R(v)" else CURVES
 
     @property
     def count(self) -> int:

@@ -123,7 +123,10 @@ class Search:
         """The best set in front of a base's map that has none but the effects of `h`: a map takes some of them up."""
         now = h.copy()
         now.base, now.plain, now.force, now.force_coefficients = base, base.plain, base.force, base.force_coefficients
-        if h.force is not None or set(h.effects) <= set(base.effects):
+        for e in h.effects:
+            if base.force is not None and base_name(e) in base.force.takes_up:
+                now = now.without(e)
+        if h.force is not None or set(now.effects) <= set(base.effects):
             return base
         return max(base, self._pruned(self._put(fit(now, 10)), last=True), key=lambda h: h.score)
 
@@ -215,6 +218,8 @@ class Search:
             if e.name not in self.effects and e.base not in self.effects:
                 continue
             if e.base in own or e.name == "command_hold" or not e.needs <= set(data.channels):
+                continue
+            if h.force is not None and e.base in h.force.takes_up:
                 continue
             if e.name == "~linear" and not self.alone:
                 continue

@@ -17,7 +17,7 @@ from avtorch.gap.answer.budget import LIKELY
 from avtorch.gap.answer.verdict import LEAST_LISTED
 from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.coordinates import EFFECTS, base_name
-from avtorch.gap.engine.force_map import ForceMap
+from avtorch.gap.engine.force_map import CURVES, ForceMap
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.priors import TEMPER
 from avtorch.gap.quantity import Quantity
@@ -26,10 +26,7 @@ from avtorch.gap.result.parameters import ParameterPosterior
 from avtorch.io.units import GRAVITY
 
 FAMILIES = {
-    "force map": (
-        *("dead_band", "saturation", "brake_throttle_asymmetry", "speed_dependent_gain"),
-        *("aerodynamic_drag", "constant_resistance", "low_speed_creep"),
-    ),
+    "force map": CURVES,
     "dynamics": (
         *("dead_time", "backlash", "second_order_actuator", "rate_limit", "speed_dependent_lag", "gear_shift"),
         "driveline_oscillation",

@@ -19,7 +19,7 @@ from avtorch.gap import DeadTime, Effect
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.evidence import evaluate_evidence
 from avtorch.gap.engine.force_base import prices, with_force_map
-from avtorch.gap.engine.force_map import MAP_SIZES, ForceMap, MapForm, map_forms, size_log_prior
+from avtorch.gap.engine.force_map import CURVES, MAP_SIZES, ForceMap, MapForm, map_forms, size_log_prior
 from avtorch.gap.engine.gauss_newton import force_columns, linearised
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.inference import Inference, infer
@@ -163,6 +163,12 @@ def test_a_bent_command_is_worth_a_map() -> None:
     assert nats > 5.0
     assert m.evidence > h.evidence + nats
     assert m.evidence == pytest.approx(evaluate_evidence(m.evaluate()).evidence, abs=0.01)
+
+
+def test_what_a_map_takes_up_is_not_tried_beside_it() -> None:
+    search = found().search
+    assert "constant_resistance" in {e for h in search.visited.values() if h.force is None for e in h.effects}
+    assert not {e for h in search.visited.values() if h.force is not None for e in h.effects} & set(CURVES)
 
 
 # answers --------------------------------------------------------------------------------------------------------------
