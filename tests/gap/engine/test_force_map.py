@@ -167,7 +167,9 @@ def test_a_bent_command_is_worth_a_map() -> None:
 
 def test_what_a_map_takes_up_is_not_tried_beside_it() -> None:
     search = found().search
-    assert "constant_resistance" in {e for h in search.visited.values() if h.force is None for e in h.effects}
+    (base,) = (h for h in search.map_bases if h.force is not None and h.force.name == "F(u, v)")
+    plain, mapped = ({e.name for e in search._candidates(h)} for h in (search.base, base))
+    assert plain - mapped == {"constant_resistance"}
     assert not {e for h in search.visited.values() if h.force is not None for e in h.effects} & set(CURVES)
 
 
