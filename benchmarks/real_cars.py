@@ -21,7 +21,6 @@ import numpy as np
 from avtorch.errors import InputError
 from avtorch.follower import FollowerDiagnosis, diagnose_follower
 from avtorch.gap.effects.road_grade import GRAVITY
-from avtorch.gap.engine.likelihood import whiten
 from avtorch.io import Log, read_following
 from avtorch.io.openacc import numbered
 from avtorch.io.tables import read_table
@@ -81,7 +80,7 @@ def slope_coefficient(found: FollowerDiagnosis, log: Log, grade: np.ndarray) -> 
     steps = np.diff(log.time)
     gained = np.concatenate([[0.0], np.cumsum(0.5 * steps * (pull[1:] + pull[:-1]))])
     response = data.transform([data.speed_difference(gained[data.source])])
-    image, left = (whiten(data, one.noise[:, None, None], x) for x in (response, one.candidate.residual(one.z[None])))
+    image, left = ((x / np.sqrt(one.noise)).ravel() for x in (response, one.candidate.residual(one.z[None])))
     square = float(image @ image)
     return float(image @ left) / square, square**-0.5
 

@@ -1,7 +1,7 @@
 """A car that follows: its controller's law in front of the plant, compared with its speed in the engine's coefficients.
 
 The law's inputs are the measured signals, so that a rollout covers the plant alone. Unmodelled motion of the car feeds
-back through its own sensors; fitted over the whole band it does not bias the loop (prediction-error identification, see
+back through its own sensors; fitted over the whole band it does not bias the loop (prediction-error identification; see
 `gap.engine.likelihood`). `K_L` is held at 1: it cannot be distinguished from the law's gains. The recorder has no delay
 or filter of its own here: nothing tells it from those of the car.
 """

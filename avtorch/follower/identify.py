@@ -1,8 +1,8 @@
 """Law, lag and delay estimated from a car-following log, with intervals that cover the spread between its parts.
 
-The likelihood is the engine's (`gap.engine.likelihood`): the noise may have any spectrum and is integrated out, because
-a real controller does much that no law predicts. It alone gives intervals that are too narrow, so the spread between
-fits to parts of the drive widens them.
+Speeds are compared in the engine's coefficients under the noise of `loop_noise`, because a real controller does much
+that no law predicts. The likelihood alone gives intervals that are too narrow, so the spread between fits to parts of
+the drive widens them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.follower.followed import Followed
-from avtorch.gap.engine.likelihood import log_likelihood, whiten
+from avtorch.follower.loop_noise import LoopNoise
 from avtorch.gap.simulator.effect import delay_key
 
 _ITERATIONS = 30
@@ -35,7 +35,7 @@ _DELAYS_S = (0.3, 1.2)
 class Identified:
     """`z` (coordinate,) at the mode, its `covariance`; `log_evidence` [nats] of the fit.
 
-    `noise` (band,): variance of the differenced speed's coefficients at the mode [(m/s²)²].
+    `noise` (bin,): variance of the differenced speed's coefficients [(m/s²)²].
 
     Example:
         >>> from avtorch import Leader, LinearController, simulate
@@ -73,9 +73,9 @@ def identified(candidate: Followed, *, start: Identified | None = None) -> Ident
     places = [_mode(candidate, z) for z in (_starts(candidate) if start is None else [start.z])]
     best = max(places, key=lambda place: place.value)
     information = _curvature(candidate, best)[0]
-    evidence = best.value - 0.5 * float(np.linalg.slogdet(information)[1])
+    size = np.linalg.slogdet(information)[1] + np.linalg.slogdet(best.noise.information)[1]
     covariance = np.asarray(np.linalg.inv(information), np.float64)
-    return Identified(candidate, best.z, covariance, best.noise[:, 0, 0], evidence)
+    return Identified(candidate, best.z, covariance, best.noise.variance, best.value - 0.5 * float(size))
 
 
 def widened(found: Identified) -> FloatArray:
@@ -102,28 +102,27 @@ def widened(found: Identified) -> FloatArray:
 
 
 class _Place(NamedTuple):
-    """`value` [nats] of log likelihood and prior at `z` (coordinate,), the `residual` (frame, bin), and the noise's
-    covariance (band, 1, 1)."""
+    """`value` [nats] of log likelihood and prior at `z` (coordinate,), the `residual` (frame, bin), its `noise`."""
 
     z: FloatArray
     value: float
     residual: FloatArray
-    noise: FloatArray
+    noise: LoopNoise
 
 
-def _at(own: Followed, z: FloatArray) -> _Place:
-    residual = own.residual(z[None])
-    nats, noise = log_likelihood(own.data, residual)
-    return _Place(z, nats - 0.5 * float(z @ z), residual[0], noise)
+def _at(own: Followed, z: FloatArray, before: LoopNoise | None = None) -> _Place:
+    residual, lag = own.residual(z[None])[0], float(own.values(z[None])["T_L"])
+    noise = LoopNoise.of(own.data, residual, lag, None if before is None else before.w)
+    return _Place(z, noise.value - 0.5 * float(z @ z), residual, noise)
 
 
 def _curvature(own: Followed, at: _Place) -> tuple[FloatArray, FloatArray]:
     """Information (coordinate, coordinate) and gradient (coordinate,) under the noise at a place; all derivatives are
     one batch of rollouts."""
     ahead = own.residual(at.z + _STEP * np.eye(own.size))
-    slopes = np.stack([whiten(own.data, at.noise, (at.residual - x)[None]) for x in ahead]) / _STEP
-    white = whiten(own.data, at.noise, at.residual[None])
-    return slopes @ slopes.T + np.eye(own.size), slopes @ white - at.z
+    sd = np.sqrt(at.noise.variance)
+    slopes = ((at.residual - ahead) / (_STEP * sd)).reshape(own.size, -1)
+    return slopes @ slopes.T + np.eye(own.size), slopes @ (at.residual / sd).ravel() - at.z
 
 
 def _mode(own: Followed, z: FloatArray) -> _Place:
@@ -135,7 +134,7 @@ def _mode(own: Followed, z: FloatArray) -> _Place:
         while better is None and damping < 1e4:
             step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
             step *= min(1.0, _LONGEST / max(float(np.abs(step).max()), 1e-12))
-            new = _at(own, np.clip(at.z + step, -_FARTHEST, _FARTHEST))
+            new = _at(own, np.clip(at.z + step, -_FARTHEST, _FARTHEST), at.noise)
             if new.value > at.value:
                 better = new
             else:
