@@ -39,7 +39,7 @@ class PredictiveModel:
     def of(cls, posterior: ParameterPosterior, baseline: GapPlant | None, noise: NoiseSpectrum) -> PredictiveModel:
         """The predictive model of a weight of the model average."""
         weight = posterior.weight
-        grade = weight.composition.slow.road_sd / GRAVITY if weight.slow == "road_grade" else None
+        grade = weight.composition.slow.road_sd / GRAVITY if "road_grade" in posterior.names else None
         return cls(
             name=weight.label,
             plant=posterior.plant(baseline, weight.composition.slow.process_noise),
