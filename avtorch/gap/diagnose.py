@@ -183,7 +183,7 @@ def diagnose(
     scope = _scope(inference, shown, data.channels, pairs)
     lag_and_gain, assumed = base_quantities(none, seed)
     bare = _base_weight(inference)
-    simulator = ParameterPosterior(bare).plant(base, bare.composition.slow.process_noise)
+    simulator = ParameterPosterior(bare).plant(base, bare.process_noise)
     errors = [rows.errors(h) for h in (none, best)]
     return Diagnosis(
         log=LogFacts.of(each),
@@ -200,7 +200,7 @@ def diagnose(
         onset_s=None if onset is None or names == ("none",) else onset.stamp_s,
         onset_from_start_s=None if onset is None or names == ("none",) else onset.from_start_s,
         onset_log=0 if onset is None else onset.log,
-        plant=chosen.plant(base, weight.composition.slow.process_noise) if named else None,
+        plant=chosen.plant(base, weight.process_noise) if named else None,
         simulator=simulator,
         belief=chosen.belief() if named else assumed,
         assumed=assumed,

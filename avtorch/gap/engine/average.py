@@ -100,6 +100,12 @@ class Weight:
     slow: str
     outliers: bool
 
+    @property
+    def process_noise(self) -> float:
+        """White jerk behind the actuator [m/s³/√Hz]: what is left of it where there is a gust."""
+        slow = self.composition.slow
+        return slow.process_noise_beside_gust if self.slow == "gust" else slow.process_noise
+
 
 @dataclass(frozen=True, eq=False)
 class ModelAverage:
