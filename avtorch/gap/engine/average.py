@@ -42,15 +42,6 @@ _FAINT_GUST = FAINT_OF_RANGE * TABLE["gust"].parameters[0].low
 _LARGE_OF_COMMAND = 0.2  # a slow force has a name, with one channel, from this share of the command's spread on
 _LEAST_LISTED = 1e-4
 
-_SHAPES = {
-    "sided": frozenset({"brake_throttle_asymmetry"}),
-    "linear": frozenset({"second_order_actuator", "sensor_lag", "driveline_oscillation"}),
-    "map": frozenset({"saturation", "dead_band", "speed_dependent_gain", "brake_throttle_asymmetry"}),
-    "gain": frozenset({"gain_change"}),
-    "delay": frozenset({"dead_time", "command_hold"}),
-}
-"""Effects whose shape a free form has, were it not exact."""
-
 SLOW = ("none", "gust", "road_grade")
 
 
@@ -308,9 +299,8 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
         if x.mirror:
             labels += _echoes(x, names)
         if c.form:
-            # the free form of a named effect's own family is its shape, and no cause without a name
-            own = bool(_SHAPES.get(c.form, frozenset()) & set(names))
-            labels = [(names if own else None, -UNKNOWN_NATS)] + [
+            # beside names it is a part without one; alone it is the cause
+            labels = [(names or None, -UNKNOWN_NATS)] + [
                 (label, worth + shape_log_odds(c.relative, c.nats, h.effects)) for label, worth in labels
             ]
         total, kinds = dict(c.total), SLOW
