@@ -2,9 +2,9 @@
 
 In an annotation `Float[Tensor, "chain window time"]` is a tensor of floats with these dimensions, `"*batch time"` one
 with any dimensions before time, `"*#batch"` one that broadcasts with all others of that name, `"window 3"` one whose
-last dimension is three. A name stands for one length within a call. The tests check every such annotation of `vehicle`,
-`inference` and `gap.likelihood` against the tensors passed (jaxtyping, beartype). Outside the tests it is `Annotated`:
-a type checker reads `Tensor`, and it costs nothing.
+last dimension is three. A name stands for one length within a call. The tests check every such annotation of `vehicle`
+and `inference` against the tensors passed (jaxtyping, beartype). Outside the tests it is `Annotated`: a type checker
+reads `Tensor`, and it costs nothing.
 """
 
 from __future__ import annotations

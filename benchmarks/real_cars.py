@@ -4,8 +4,8 @@
 
 Reads the OpenACC platoons in ``openacc_astazero`` and ``openacc_zalazone`` and prints a line a car. ``--cause`` also
 diagnoses the test half of each drive. ``--slope`` prints how strongly the surveyed slope (AstaZero) acts on each
-follower's speed, as the slope's coefficient in the identified loop: 1 for a car that does not compensate it. It also
-compares a slope fitted without the survey with the surveyed one. ``--only TEXT``: files with that in their path.
+follower's speed, as the slope's coefficient in the identified loop: 1 for a car that does not compensate it.
+``--only TEXT``: files with that in their path.
 """
 
 from __future__ import annotations
@@ -13,19 +13,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from avtorch.errors import InputError
 from avtorch.follower import FollowerDiagnosis, diagnose_follower
-from avtorch.gap.effects import RoadGrade
 from avtorch.gap.effects.road_grade import GRAVITY
-from avtorch.gap.likelihood.gauss_newton import finish, modes
-from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.io import Log, read_following
 from avtorch.io.openacc import numbered
 from avtorch.io.tables import read_table
@@ -76,44 +71,18 @@ def row_of(found: FollowerDiagnosis, log: Log) -> dict[str, Any]:
 def slope_coefficient(found: FollowerDiagnosis, log: Log, grade: np.ndarray) -> tuple[float, float]:
     """Share of the surveyed ``grade`` (row,) [-] that the car's controller does not compensate: mean and sd.
 
-    By regression of the loop's whitened errors on the whitened response to the slope, with law and plant fixed.
+    By regression of what the loop leaves of the speed on the response to the slope, under the loop's noise, with law
+    and plant fixed.
     """
     pull = -GRAVITY * grade
-    record, one = found.identified.hypothesis.record, found.identified
+    one = found.identified
+    data = one.candidate.data
     steps = np.diff(log.time)
     gained = np.concatenate([[0.0], np.cumsum(0.5 * steps * (pull[1:] + pull[:-1]))])
-    white = WhiteningFilter(record, one.noise)
-    image = white(gained[record.source][None, :, None]).ravel()
-    left = white(one.errors(record)).ravel()
+    response = data.transform([data.speed_difference(gained[data.source])])
+    image, left = ((x / np.sqrt(one.noise)).ravel() for x in (response, one.candidate.residual(one.z[None])))
     square = float(image @ image)
     return float(image @ left) / square, square**-0.5
-
-
-def slope_recovered(found: FollowerDiagnosis, grade: np.ndarray) -> dict[str, float]:
-    """A slope fitted together with law, lag and delay, compared with the surveyed ``grade`` (row,) [-].
-
-    ``correlation``; ``rmse`` [-] about both means; ``zero``: the same of no slope at all.
-    """
-    own = found.identified.hypothesis
-    candidate = replace(own, effects=(*own.effects, RoadGrade))
-    white = WhiteningFilter(own.record, found.identified.noise)
-    z, _ = modes(candidate, white, found.identified.z[None])
-    profile = finish(candidate, white, z[0]).profile
-    assert profile is not None
-    estimated, true, first = [], [], 0
-    for drive, begin in zip(own.record.drives, own.begins, strict=True):
-        assert drive.position is not None
-        road = RoadGrade().prepared(drive.time, drive.speed, drive.position)
-        force = road.force(drive.position, torch.as_tensor(profile[first : first + road.knots]))
-        estimated.append(-force.numpy() / GRAVITY)
-        true.append(grade[begin : begin + len(drive.time)])
-        first += road.knots
-    a, b = (x - x.mean() for x in (np.concatenate(estimated), np.concatenate(true)))
-    return {
-        "correlation": float(np.corrcoef(a, b)[0, 1]),
-        "rmse": float(np.sqrt(np.mean((a - b) ** 2))),
-        "zero": float(np.sqrt(np.mean(b**2))),
-    }
 
 
 def main() -> None:
@@ -142,7 +111,6 @@ def main() -> None:
             positions = table.numbers(f"X{number}")[keep]
             grade = np.interp(np.mod(positions, LAP_M), survey.numbers("X"), survey.numbers("Y"))
             row["slope"] = slope_coefficient(found, log, grade)
-            row["slope_recovered"] = slope_recovered(found, grade)
         rows.append(row)
         print(json.dumps(row), flush=True)
     if given.json:

@@ -34,7 +34,7 @@ SLOW = frozenset(
         "avtorch.follower.diagnose_follower.diagnose_follower",
         "avtorch.follower.identify.Identified",
         "avtorch.gap",
-        "avtorch.gap.diagnose.gap_budget",
+        "avtorch.gap.budget.gap_budget",
         "avtorch.gap.answer.budget.Budget",
         "avtorch.gap.compare.compare",
         "avtorch.gap.diagnose.diagnose",

@@ -7,14 +7,12 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from avtorch.arrays import Float
 from avtorch.errors import InputError
-from avtorch.gap.likelihood.grade_marginal import GradeMarginal
 from avtorch.inference import JerkStatistics
 from avtorch.inference.estimators.state_model import GaussianState
 from avtorch.vehicle import Block
@@ -86,13 +84,6 @@ def test_the_fields_of_a_named_tuple_are_under_the_check() -> None:
         GaussianState(mean, mean)
 
 
-def test_likelihood_is_under_the_check() -> None:
-    marginal = GradeMarginal.of(np.eye(2, 5))
-    marginal.by_size(np.zeros((3, 2)))
-    with pytest.raises(ShapeError, match="match"):
-        marginal.by_size(np.zeros(2))
-
-
 ROOT = Path(__file__).resolve().parents[1] / "avtorch"
 ANY_SHAPE = {
     "state.generator_of": "the bytes of a generator's state",
@@ -128,7 +119,7 @@ def bare(path: Path) -> Iterator[str]:
 
 
 def test_what_is_public_names_its_shapes() -> None:
-    rooms = [ROOT / name for name in ("vehicle", "inference", "gap/likelihood")]
+    rooms = [ROOT / name for name in ("vehicle", "inference")]
     files = [ROOT / "gap/drive_record.py", *(path for room in rooms for path in sorted(room.rglob("*.py")))]
     assert len(files) > 60
     assert {name for path in files for name in bare(path)} == set(ANY_SHAPE)

@@ -97,11 +97,11 @@ def next_experiment(
         >>> from avtorch import Leader, diagnose, simulate
         >>> from avtorch.experiment import next_experiment
         >>> from avtorch.gap import DeadTime, plant
-        >>> late = plant([DeadTime(0.4)], sigma=0.0)
-        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
+        >>> late = plant([DeadTime(0.25)], sigma=0.1)
+        >>> log = simulate(Leader.default(start=50.0, duration=20.0, dt=0.1), plant=late).log()
         >>> found = diagnose(log, effects=["dead_time"], pairs=False)
         >>> next_experiment(found).separates
-        ('dead_time', 'none')
+        ('none', 'dead_time')
     """
     rivals = list(found.contenders)
     if len(rivals) < 2:

@@ -1,22 +1,22 @@
 """The prediction of each remaining cause for a manoeuvre: a normal distribution of the measured rows.
 
 Its mean is the rollout at the posterior mean of the parameters, its spread that of rollouts at posterior draws (and at
-draws of the unknown slope); its noise is that of the log.
+draws of the unknown slope); its noise is that of the log. Measurements are compared as a diagnosis compares them, in
+the engine's coefficients: nearly independent, each with the noise of its frequency.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.experiment.manoeuvres import Manoeuvre
-from avtorch.gap.drive_record import Record
-from avtorch.gap.likelihood.noise_draws import noise_draws
-from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
@@ -43,29 +43,28 @@ def responses(contender: PredictiveModel, manoeuvres: Sequence[Manoeuvre], draws
 
 @dataclass(frozen=True, eq=False)
 class PredictiveLaw:
-    """One contender's prediction of one manoeuvre: `mean` (channel, row), `spread` (direction, channel, row), noise."""
+    """One contender's prediction of one manoeuvre in coefficients: `mean` (channel, frame, bin), `spread` (direction,
+    channel, frame, bin), and a `root` (bin, channel, channel) of the noise's covariance."""
 
-    white: WhiteningFilter = field(repr=False)
     mean: FloatArray = field(repr=False)
     spread: FloatArray = field(repr=False)
+    root: FloatArray = field(repr=False)
 
     def log_density(self, measured: FloatArray) -> FloatArray:
-        """Log density of rows (draw, channel, row): (draw,) [nats]."""
-        e = self._white(measured - self.mean)
-        u = self._white(self.spread)
-        constant = self.white.constant_of(coarse=False)
+        """Log density of coefficients (draw, channel, frame, bin): (draw,) [nats]."""
+        e, u = self.whitened(measured - self.mean), self.whitened(self.spread)
+        frames = self.mean.shape[1]
+        scale = frames * float(np.log(np.einsum("kcc->kc", self.root)).sum())
+        constant = -scale - 0.5 * self.mean.size * float(np.log(2 * np.pi))
         gram = np.eye(len(u)) + u @ u.T
         match = e @ u.T
         taken = np.linalg.solve(gram, match.T).T
         size = float(np.linalg.slogdet(gram)[1])
         return constant - 0.5 * ((e**2).sum(-1) - (match * taken).sum(-1) + size)
 
-    def _white(self, errors: FloatArray) -> FloatArray:
-        """Whitened errors (column, white row) from errors (column, channel, row)."""
-        if not len(errors):
-            return np.zeros((0, 1))
-        kept = errors[..., self.white.record.source, None]
-        return self.white(kept).reshape(len(errors), -1)
+    def whitened(self, errors: FloatArray) -> FloatArray:
+        """Errors (column, channel, frame, bin) in units of the noise: (column, coefficient)."""
+        return np.einsum("kcd,ndfk->ncfk", np.linalg.inv(self.root), errors).reshape(len(errors), -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,27 +110,40 @@ class ManoeuvrePrediction:
 
     def law(self, number: int) -> PredictiveLaw:
         """The prediction for manoeuvre `number`."""
-        some = self.rollouts[number, ::2]
+        some = self.coefficients(self.rollouts[number, ::2])
         mean = some.mean(0)
         spread = (some - mean) / np.sqrt(max(len(some) - 1, 1))
         road = self._road(number)
-        white = WhiteningFilter(
-            _record(self.manoeuvres[number], self.channels), self.contender.noise.of_means(self.group)
-        )
-        return PredictiveLaw(white, mean, spread if road is None else np.concatenate([spread, road]))
+        return PredictiveLaw(mean, spread if road is None else np.concatenate([spread, road]), self._root)
 
     def examples(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Simulated measurements, (draw, channel, row)."""
-        some = self.rollouts[number, 1::2]
-        count, _, rows = some.shape
-        time = self.manoeuvres[number].time
-        noise = self.contender.noise.of_means(self.group)
-        seen = some + noise_draws(noise, rows, float(time[1] - time[0]), self.channels, count, rng)
+        """Coefficients of simulated measurements, (draw, channel, frame, bin)."""
+        some = self.coefficients(self.rollouts[number, 1::2])
+        seen = some + np.einsum("kcd,ndfk->ncfk", self._root, rng.standard_normal(some.shape))
         road = self._road(number)
-        return seen if road is None else seen + np.einsum("dk,kwr->dwr", rng.standard_normal((count, len(road))), road)
+        return seen if road is None else seen + np.tensordot(rng.standard_normal((len(seen), len(road))), road, 1)
+
+    def coefficients(self, rows: FloatArray) -> FloatArray:
+        """Readings (column, channel, row) as coefficients (column, channel, frame, bin)."""
+        data = self._frames
+        each = [dict(zip(self.channels, one, strict=True)) for one in rows]
+        return np.stack([data.transform(data.channel_rows(x.get("accel"), x.get("speed"))) for x in each])
+
+    @cached_property
+    def _frames(self) -> DriveData:
+        """The frames that a log of a manoeuvre has; they depend on its time alone."""
+        m = self.manoeuvres[0]
+        speed = np.maximum(m.speed, _SLOWEST_MPS)
+        given = {"accel": np.gradient(speed, m.time), "speed": speed}
+        log = Log.from_arrays(time=m.time, accel_cmd=m.command, **{name: given[name] for name in self.channels})
+        return DriveData.of(log).below(self.contender.noise.highest)
+
+    @cached_property
+    def _root(self) -> FloatArray:
+        return np.asarray(np.linalg.cholesky(self.contender.noise.at(self._frames, self.group)), np.float64)
 
     def _road(self, number: int) -> FloatArray | None:
-        """Directions (knot, channel, row) in which an unknown slope moves the measurements."""
+        """Directions (knot, channel, frame, bin) in which an unknown slope moves the measurements."""
         size = self.contender.grade_rms
         if not size:
             return None
@@ -145,12 +157,4 @@ class ManoeuvrePrediction:
         gained = np.cumsum(0.5 * step * (force[:, 1:] + force[:, :-1]), -1)
         speed = np.concatenate([np.zeros((len(force), 1)), gained], -1)
         accel = np.zeros_like(force) if self.contender.specific_force else force
-        return np.stack([{"accel": accel, "speed": speed}[name] for name in self.channels], 1)
-
-
-def _record(m: Manoeuvre, channels: tuple[str, ...]) -> Record:
-    """Rows of a manoeuvre at the sampling that a diagnosis uses."""
-    speed = np.maximum(m.speed, _SLOWEST_MPS)
-    given = {"accel": np.gradient(speed, m.time), "speed": speed}
-    log = Log.from_arrays(time=m.time, accel_cmd=m.command, **{name: given[name] for name in channels})
-    return Record.of(log, rate_hz=0.9 / float(m.time[1] - m.time[0]))
+        return self.coefficients(np.stack([{"accel": accel, "speed": speed}[name] for name in self.channels], 1))

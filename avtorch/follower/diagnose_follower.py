@@ -23,7 +23,6 @@ from avtorch.follower.identify import Identified, identified, widened
 from avtorch.follower.laws import LAWS, FollowerMeasurements, HeadwayLaw, law_named, tensors
 from avtorch.follower.loop_stability import LoopStability, loop_stability
 from avtorch.gap.diagnose import diagnose
-from avtorch.gap.drive_record import Record
 from avtorch.gap.quantity import Quantity, frame_of
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.effect import delay_effect, delay_key
@@ -139,12 +138,12 @@ def diagnose_follower(
     steps = called(progress)
     laws = list(LAWS.values()) if law is None else [law_named(law)]
     plain = followed(log, laws[0])
-    record = plain.record
-    if record.rows * record.dt < _LEAST_S:
+    if plain.seconds < _LEAST_S:
         raise InputError(
-            f"{log.name}: {record.rows * record.dt:.0f} s of following (moving, engaged), needs {_LEAST_S:g} s or more"
+            f"{log.name}: {plain.seconds:.0f} s of following (moving, engaged), needs {_LEAST_S:g} s or more"
         )
-    halves = _halves(record)
+    middle = int(plain.data.source[len(plain.data.source) // 2])
+    halves = log[:middle], log[middle:]
     tried: dict[str, tuple[LoopErrors, Identified]] = {}
     for i, own in enumerate(laws):
         if steps is not None:
@@ -153,10 +152,11 @@ def diagnose_follower(
     best = min(tried, key=lambda name: tried[name][0].speed)
     chosen, first = LAWS[best], tried[best][1]
     bare, _ = _crossed(followed(log, chosen, dead_time=False), halves)
-    full = identified(first.candidate, start=first)
-    draws = full.draws(widened(full, record), seed=seed)
-    speeds = np.quantile(record.measured[-1], (0.1, 0.5, 0.9))
-    keeps = keeps_speed([_longest(first.candidate, half) for half in halves], _step(record))
+    full = identified(first.candidate.on(log), start=first)
+    draws = full.draws(widened(full), seed=seed)
+    assert plain.data.speed is not None
+    speeds = np.quantile(plain.data.speed, (0.1, 0.5, 0.9))
+    keeps = keeps_speed([_longest(plain.on(half)) for half in halves], plain.data.dt)
     return FollowerDiagnosis(
         name=log.name,
         law=chosen,
@@ -166,54 +166,39 @@ def diagnose_follower(
         loops={name: errors for name, (errors, _) in tried.items()} | {"without_delay": bare},
         keeps_speed=keeps,
         stability=tuple(loop_stability(chosen, draws, speeds.tolist())),
-        diagnosis=_cause(log, first, halves[1], effects, seed, steps) if cause else None,
+        diagnosis=_cause(first, halves[1], effects, seed, steps) if cause else None,
         conditional=_conditional(chosen, tried[best][0].speed, keeps),
     )
 
 
-def _halves(record: Record) -> tuple[Record, Record]:
-    numbers = np.arange(record.rows)
-    half = record.rows // 2
-    return record.only(numbers < half), record.only(numbers >= half)
-
-
-def _crossed(candidate: Followed, halves: tuple[Record, Record]) -> tuple[LoopErrors, Identified]:
+def _crossed(candidate: Followed, halves: tuple[Log, Log]) -> tuple[LoopErrors, Identified]:
     """The closed loop's errors on each half with parameters fitted to the other, and the fit to the first."""
-    first, second = (identified(candidate, half) for half in halves)
+    own = [candidate.on(half) for half in halves]
+    found = [identified(half) for half in own]
     each = [
-        loop_errors(candidate.law, found.values, _longest(candidate, half), _step(half))
-        for found, half in ((first, halves[1]), (second, halves[0]))
+        loop_errors(candidate.law, fit.values, _longest(half), half.data.dt)
+        for fit, half in zip(found, reversed(own), strict=True)
     ]
-    return LoopErrors(*(float(np.sqrt(np.mean(np.square(pair)))) for pair in zip(*each, strict=True))), first
+    return LoopErrors(*(float(np.sqrt(np.mean(np.square(pair)))) for pair in zip(*each, strict=True))), found[0]
 
 
-def _step(record: Record) -> float:
-    return record.dt / record.group
-
-
-def _longest(candidate: Followed, half: Record) -> FollowerMeasurements:
-    """The measurements of the longest stretch of a half."""
-    offsets = np.cumsum([0, *(len(s.speed) for s in candidate.seen)])
-    number = np.bincount(half.stretch).argmax()
-    rows = half.source[half.stretch == number] * half.group
-    drive = int(np.searchsorted(offsets, rows[0], side="right") - 1)
-    part = slice(int(rows[0] - offsets[drive]), int(rows[-1] - offsets[drive]) + half.group)
-    return FollowerMeasurements(*(x[part] for x in candidate.seen[drive]))
+def _longest(half: Followed) -> FollowerMeasurements:
+    """The measurements of the longest stretch of a half, once the car has settled."""
+    seen = max(half.seen, key=lambda stretch: len(stretch.speed))
+    return FollowerMeasurements(*(x[half.data.warm_rows :] for x in seen))
 
 
 def _cause(
-    log: Log,
     first: Identified,
-    half: Record,
+    half: Log,
     effects: Sequence[str] | None,
     seed: int,
     steps: Callable[[str, int, int], None] | None,
 ) -> Diagnosis:
     """The diagnosis of the test half, with the law's commands, starting from the lag and delay of the other half."""
     law = tensors({k.removeprefix("law."): v for k, v in first.values.items() if k.startswith("law.")})
-    sent = first.candidate.law.command(law, seen_in(log)).numpy()
-    begin = first.candidate.on(half).row(0)
-    late = replace(log, accel=None, accel_cmd=np.clip(sent, _LOWEST, _HIGHEST))[begin : log.rows]
+    sent = first.candidate.law.command(law, seen_in(half)).numpy()
+    late = replace(half, accel=None, accel_cmd=np.clip(sent, _LOWEST, _HIGHEST))
     return diagnose(late, baseline=car_of(first.values), effects=effects, seed=seed, progress=steps or False)
 
 

@@ -1,6 +1,6 @@
-"""Law, lag and delay estimated from a car-following record, with intervals that cover the spread between its parts.
+"""Law, lag and delay estimated from a car-following log, with intervals that cover the spread between its parts.
 
-The noise is an Ornstein-Uhlenbeck force and jerk noise (with the prior of a gust), because a real controller does much
+Speeds are compared in the engine's coefficients under the noise of `loop_noise`, because a real controller does much
 that no law predicts. The likelihood alone gives intervals that are too narrow, so the spread between fits to parts of
 the drive widens them.
 """
@@ -10,20 +10,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.errors import InputError
 from avtorch.follower.followed import Followed
-from avtorch.gap.drive_record import Record
-from avtorch.gap.likelihood.gauss_newton import finish, modes, residuals
-from avtorch.gap.likelihood.noise_fit import GUST, fit_noise
-from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.follower.loop_noise import LoopNoise
 from avtorch.gap.simulator.effect import delay_key
 
-_START = NoiseModel(process_sd=0.05, force_sd=0.1, speed_sd=0.02)
-_TURNS = 5
+_ITERATIONS = 30
+_ENOUGH = 0.01  # nats that a last step gains
+_STEP = 1e-4  # of finite differences
+_LONGEST = 1.0  # step, in standard deviations of the prior
+_FARTHEST = 5.0
 _DRAWS = 2000
 _PART_S = 60.0
 _PARTS = 6
@@ -32,7 +33,9 @@ _DELAYS_S = (0.3, 1.2)
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """`z` (coordinate,) at the mode, its `covariance`, `noise`; `log_evidence` [nats] of the fit.
+    """`z` (coordinate,) at the mode, its `covariance`; `log_evidence` [nats] of the fit.
+
+    `noise` (bin,): variance of the differenced speed's coefficients [(m/s²)²].
 
     Example:
         >>> from avtorch import Leader, LinearController, simulate
@@ -47,7 +50,7 @@ class Identified:
     candidate: Followed = field(repr=False)
     z: FloatArray
     covariance: FloatArray = field(repr=False)
-    noise: NoiseModel
+    noise: FloatArray = field(repr=False)
     log_evidence: float
 
     @property
@@ -64,45 +67,32 @@ class Identified:
         z = np.clip(self.z + noise @ spread.T, -8.0, 8.0)
         return {k: x.numpy() for k, x in self.candidate.values(z).items()}
 
-    def errors(self, record: Record) -> FloatArray:
-        """Residuals, measured minus simulated, (channel, counted, group) at the rows of `record`."""
-        return self.candidate.on(record).errors(self.z[None])[0]
+
+def identified(candidate: Followed, *, start: Identified | None = None) -> Identified:
+    """The fit to the candidate's log, from a short and a long delay, or from another fit's place."""
+    places = [_mode(candidate, z) for z in (_starts(candidate) if start is None else [start.z])]
+    best = max(places, key=lambda place: place.value)
+    information = _curvature(candidate, best)[0]
+    size = np.linalg.slogdet(information)[1] + np.linalg.slogdet(best.noise.information)[1]
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
+    return Identified(candidate, best.z, covariance, best.noise.variance, best.value - 0.5 * float(size))
 
 
-def identified(candidate: Followed, record: Record | None = None, *, start: Identified | None = None) -> Identified:
-    """Fit to `record` (default: all rows), parameters and noise in turn, from a short and a long delay."""
-    record = candidate.record if record is None else record
-    own = candidate.on(record)
-    noise, value = _START if start is None else start.noise, -np.inf
-    z = _starts(own) if start is None else start.z[None]
-    for _ in range(_TURNS):
-        white = WhiteningFilter(record, noise)
-        tried, worth = modes(own, white, z, iterations=12, enough=0.1)
-        z = tried[[int(np.argmax(worth))]]
-        errors = residuals(own, white, z[0], coarse=False)
-        lag = float(own.values(z)["T_L"][0])
-        fitted = fit_noise(record, errors, noise, T_L=lag, priors=GUST, iterations=4)
-        noise = fitted.noise
-        new = float(fitted.rows.sum()) + fitted.log_prior - 0.5 * float(z[0] @ z[0])
-        if new < value + 0.5:
-            break
-        value = new
-    fit = finish(own, WhiteningFilter(record, noise), z[0])
-    return Identified(candidate, fit.z, fit.covariance, noise, fit.log_evidence + fitted.log_prior)
-
-
-def widened(found: Identified, record: Record) -> FloatArray:
-    """The fit's covariance, each coordinate widened by the excess spread of fits to parts of `record`."""
-    count = int(min(_PARTS, record.rows * record.dt // _PART_S))
+def widened(found: Identified) -> FloatArray:
+    """The fit's covariance, each coordinate widened by the excess spread of fits to parts of its log."""
+    own = found.candidate
+    count = int(min(_PARTS, own.seconds // _PART_S))
     if count < 2:
         return found.covariance
-    edges = np.linspace(0, record.rows, count + 1).astype(int)
-    numbers = np.arange(record.rows)
+    edges = [*own.data.source[np.arange(count) * len(own.data.source) // count].tolist(), own.log.rows]
     parts = []
-    for first, last in pairwise(edges.tolist()):
-        part = record.only((numbers >= first) & (numbers < last))
-        if part.rows * part.dt > 0.3 * _PART_S:
-            parts.append(identified(found.candidate, part, start=found).z)
+    for first, last in pairwise(edges):
+        try:
+            part = own.on(own.log[first:last])
+        except InputError:  # no stretch of it is long enough
+            continue
+        if part.seconds > 0.3 * _PART_S:
+            parts.append(identified(part, start=found).z)
     if len(parts) < 2:
         return found.covariance
     # the same prior pulls each part: their spread is a lower bound on the uncertainty
@@ -111,15 +101,56 @@ def widened(found: Identified, record: Record) -> FloatArray:
     return found.covariance * np.outer(wider, wider)
 
 
-def _starts(candidate: Followed) -> FloatArray:
-    centre = np.zeros(candidate.size)
-    keys = [c.key for c in candidate.coordinates]
-    if delay_key() not in keys:
-        return centre[None]
-    at = keys.index(delay_key())
-    out = np.tile(centre, (len(_DELAYS_S), 1))
-    out[:, at] = [candidate.coordinates[at].z_of(d) for d in _DELAYS_S]
-    return out
+class _Place(NamedTuple):
+    """`value` [nats] of log likelihood and prior at `z` (coordinate,), the `residual` (frame, bin), its `noise`."""
+
+    z: FloatArray
+    value: float
+    residual: FloatArray
+    noise: LoopNoise
+
+
+def _at(own: Followed, z: FloatArray, before: LoopNoise | None = None) -> _Place:
+    residual, lag = own.residual(z[None])[0], float(own.values(z[None])["T_L"])
+    noise = LoopNoise.of(own.data, residual, lag, None if before is None else before.w)
+    return _Place(z, noise.value - 0.5 * float(z @ z), residual, noise)
+
+
+def _curvature(own: Followed, at: _Place) -> tuple[FloatArray, FloatArray]:
+    """Information (coordinate, coordinate) and gradient (coordinate,) under the noise at a place; all derivatives are
+    one batch of rollouts."""
+    ahead = own.residual(at.z + _STEP * np.eye(own.size))
+    sd = np.sqrt(at.noise.variance)
+    slopes = ((at.residual - ahead) / (_STEP * sd)).reshape(own.size, -1)
+    return slopes @ slopes.T + np.eye(own.size), slopes @ (at.residual / sd).ravel() - at.z
+
+
+def _mode(own: Followed, z: FloatArray) -> _Place:
+    """Gauss-Newton with damped steps. A step across a crease of the delay gains nothing and is shortened."""
+    at, damping = _at(own, z), 1e-3
+    for _ in range(_ITERATIONS):
+        information, gradient = _curvature(own, at)
+        better = None
+        while better is None and damping < 1e4:
+            step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
+            step *= min(1.0, _LONGEST / max(float(np.abs(step).max()), 1e-12))
+            new = _at(own, np.clip(at.z + step, -_FARTHEST, _FARTHEST), at.noise)
+            if new.value > at.value:
+                better = new
+            else:
+                damping = max(damping * 8, 1e-2)
+        if better is None:
+            break
+        gain, at, damping = better.value - at.value, better, damping / 10
+        if gain < _ENOUGH:
+            break
+    return at
+
+
+def _starts(candidate: Followed) -> list[FloatArray]:
+    if delay_key() not in [c.key for c in candidate.coordinates]:
+        return [np.zeros(candidate.size)]
+    return [candidate.z_of({delay_key(): delay}) for delay in _DELAYS_S]
 
 
 def _root(covariance: FloatArray) -> FloatArray:

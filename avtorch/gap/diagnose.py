@@ -36,7 +36,7 @@ from avtorch.gap.result.hypotheses import best_weight, candidates_of, first_onse
 from avtorch.gap.result.own_random import own_random, renamed
 from avtorch.gap.result.parameters import ParameterPosterior, base_quantities
 from avtorch.gap.result.parts import force_map_of, parts_of, said_of_map
-from avtorch.gap.result.predictive_model import noise_of, predictive_models
+from avtorch.gap.result.predictive_model import predictive_models
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import uncounted
 from avtorch.gap.sensor_noise import with_sensor_noise
@@ -190,9 +190,8 @@ def diagnose(
     onset = first_onset(weight if named else top, names if named else top.label.split("+"), each)
     scope = _scope(inference, shown, data.channels, pairs)
     lag_and_gain, assumed = base_quantities(none, seed)
-    noise = noise_of(weight)
     bare = _base_weight(inference)
-    simulator = ParameterPosterior(bare).plant(base, noise_of(bare).jerk_sd)
+    simulator = ParameterPosterior(bare).plant(base, bare.process_noise)
     errors = [rows.errors(h) for h in (none, best)]
     return Diagnosis(
         log=LogFacts.of(each),
@@ -209,7 +208,7 @@ def diagnose(
         onset_s=None if onset is None or names == ("none",) else onset.stamp_s,
         onset_from_start_s=None if onset is None or names == ("none",) else onset.from_start_s,
         onset_log=0 if onset is None else onset.log,
-        plant=chosen.plant(base, noise.jerk_sd) if named else None,
+        plant=chosen.plant(base, weight.process_noise) if named else None,
         simulator=simulator,
         belief=chosen.belief() if named else assumed,
         assumed=assumed,

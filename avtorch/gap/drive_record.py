@@ -1,19 +1,17 @@
-"""The data of a diagnosis: drives at one rate, their channels, and the stretches that count.
+"""Drives as rollouts see them: at one rate, their channels, and the stretches that count.
 
 A drive is the part of a segment between two overrides: while a driver is in charge (`engaged` 0) the car does not
 follow the command, so no rollout passes through those rows, and after each override a new rollout starts from the
 measurement. Of the override rows only the measured speed is used, to integrate the position along the road.
 
-Rows above about 20 Hz are grouped. A search may begin with `coarse` rollouts, which are compared with the groups' means
-only. Scores use every row, because a controller feeds the noise of one row back into the command of the next, and means
-alone would mistake that for a lag. Rows at standstill do not count, but rollouts continue through them, as if the
-actuator still followed the command and the ground held the car.
+Rows above about 20 Hz are grouped; rollouts have every row. Rows at standstill do not count, but rollouts continue
+through them, as if the actuator still followed the command and the ground held the car.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -21,10 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Bool, BoolArray, Float, FloatArray, Int, IntArray
+from avtorch.arrays import Float, FloatArray, Int, IntArray
 from avtorch.errors import InputError
-from avtorch.gap.simulator.simulator_input import Place, SimulatorInput
-from avtorch.io import Log, fingerprint
+from avtorch.gap.simulator.simulator_input import SimulatorInput
+from avtorch.io import Log
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import AccelKind
@@ -33,7 +31,6 @@ from avtorch.io.no_command import no_command
 RATE_HZ = 20.0
 """Rows are averaged as long as the resulting rate is at least this [Hz]."""
 _SHORTEST_S = 2.0
-_FEW = 20_000  # rows of a log short enough to be rolled out in full wherever means would suffice
 _FAR_M = 1000.0  # several correlation lengths of the road grade: beyond it roads are independent
 
 
@@ -52,13 +49,12 @@ class Record:
     `accel`, `speed` (row, group): measured, all drives' rows concatenated; None: not in the log. `time` (row,) [s] from
     the start of its log; `stamp` (row,) [s] on that log's own clock, `log` (row,) its number; `command` (row,), mean of
     a group. `source`: index of every counted row in these arrays; `stretch` (counted,) numbers the stretches. `group`:
-    rows averaged into one. `coarse` are drives of averaged commands; in a short log they are the drives themselves.
-    `cuts` are the origins of the drives; drives of one segment share a road, and `position` continues along it.
+    rows averaged into one. `cuts` are the origins of the drives; drives of one segment share a road, and `position`
+    continues along it.
     """
 
     drives: tuple[SimulatorInput, ...]
     cuts: tuple[Cut, ...]
-    coarse: tuple[SimulatorInput, ...]
     time: Float[FloatArray, " row"]
     stamp: Float[FloatArray, " row"]
     log: Int[IntArray, " row"]
@@ -90,16 +86,13 @@ class Record:
         return np.flatnonzero(np.diff(self.stretch, prepend=-1))
 
     @classmethod
-    def of(cls, logs: Log | Iterable[Log], *, rate_hz: float = RATE_HZ, multiple: int = 1) -> Record:
-        """The record of one or several logs of one car. `multiple`: the number of rows of each drive is a multiple of
-        it, as in a record with groups of that size. Raises `InputError` where nothing usable is left.
-        """
+    def of(cls, logs: Log | Iterable[Log]) -> Record:
+        """The record of one or several logs of one car. Raises `InputError` where nothing usable is left."""
         each = [logs] if isinstance(logs, Log) else list(logs)
         if not each:
             raise InputError("logs: none given, needs one or more")
         drives: list[SimulatorInput] = []
         cuts: list[Cut] = []
-        coarse: list[SimulatorInput] = []
         columns: dict[str, list[FloatArray]] = {
             "time": [],
             "stamp": [],
@@ -120,7 +113,7 @@ class Record:
         if max(rates) > 1.02 * min(rates):
             given = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in each)
             raise InputError(f"logs: found rates of {given}; needs one rate in all, or one diagnosis each")
-        group = grouped(min(rates), rate_hz)
+        group = grouped(min(rates), RATE_HZ)
         steps = []
         segments = 0
         for number, log in enumerate(each):
@@ -128,7 +121,7 @@ class Record:
                 raise no_command(log, ", which the diagnosis needs")
             first_segment = segments - int(log.segment[0])
             segments = first_segment + int(log.segment[-1]) + 1
-            for cut in rolled(log, max(group, multiple)):
+            for cut in rolled(log, group):
                 begun = Cut(number, first_segment + int(log.segment[cut.start]), cut)
                 position0 = _position(log, drives, cuts, begun)
                 cuts.append(begun)
@@ -142,13 +135,10 @@ class Record:
                 settled = time - time[0] >= SETTLE_S - ROUNDING_S
                 step = float(np.median(np.diff(time)))
                 steps.append(step)
-                speed = None if log.speed is None else mean(log.speed)
                 first = max(1, round(0.3 / step))
                 accel0 = None if log.accel is None else float(mean(log.accel)[:first].mean())
                 raw = log.speed if log.speed is None else log.speed[cut]
                 drives.append(_drive(log.elapsed[cut], log.accel_cmd[cut], raw, accel0, specific, position0))
-                if group > 1:
-                    coarse.append(_drive(time, mean(log.accel_cmd), speed, accel0, specific, position0))
                 columns["time"].append(time)
                 columns["stamp"].append(log.time[cut][::group])
                 columns["log"].append(np.full(rows, number))
@@ -173,13 +163,10 @@ class Record:
         def whole(name: str) -> FloatArray | None:
             return np.concatenate(columns[name]) if columns[name] else None
 
-        whole_drives = tuple(drives)
-        few = group == 1 or sum(len(d.time) for d in drives) <= _FEW
         time, stamp, command = (np.concatenate(columns[name]) for name in ("time", "stamp", "command"))
         return cls(
-            drives=whole_drives,
+            drives=tuple(drives),
             cuts=tuple(cuts),
-            coarse=whole_drives if few else tuple(coarse),
             time=time,
             stamp=stamp,
             log=np.concatenate(columns["log"]).astype(np.int64),
@@ -192,71 +179,10 @@ class Record:
             group=group,
         )
 
-    @cached_property
-    def segments(self) -> tuple[tuple[SimulatorInput, ...], ...]:
-        """The drives of each segment that has any, in order."""
-        numbers = dict.fromkeys(cut.segment for cut in self.cuts)
-        return tuple(
-            tuple(d for d, cut in zip(self.drives, self.cuts, strict=True) if cut.segment == number)
-            for number in numbers
-        )
-
-    @cached_property
-    def segment(self) -> tuple[int, ...]:
-        """Index of each drive's segment among `segments`."""
-        numbers = {n: i for i, n in enumerate(dict.fromkeys(cut.segment for cut in self.cuts))}
-        return tuple(numbers[cut.segment] for cut in self.cuts)
-
-    def only(self, rows: Bool[BoolArray, " counted"]) -> Record:
-        """The same drives, of which only these `rows` (counted,) still count, in stretches of 2 s or more.
-
-        Rollouts cover whole drives as before; rows that no longer count are neither fitted nor scored.
-        """
-        each = 1 if self.coarse is self.drives else self.group
-        sizes = [len(d.time) * each // self.group for d in self.coarse]
-        use = np.zeros(sum(sizes))
-        use[self.source[rows]] = 1.0
-        source, stretch = _places(np.split(use, np.cumsum(sizes)[:-1]), self.dt)
-        return replace(self, source=source, stretch=stretch)
-
-    def place(self, row: int, *, coarse: bool = False) -> Place:
-        """Where the group of a counted `row` begins in the drives, or in the `coarse` ones."""
-        drives = self.coarse if coarse else self.drives
-        each = 1 if self.coarse is not self.drives and coarse else self.group
-        place, number = int(self.source[row]) * each, 0
-        while place >= len(drives[number].time):
-            place -= len(drives[number].time)
-            number += 1
-        return Place(number, place)
-
-    def at_counted_rows(
-        self, responses: Sequence[Tensor], *, coarse: bool = False
-    ) -> Float[FloatArray, "*column counted group"]:
-        """Responses by drive, (..., time) each, at counted rows: (..., counted, group), `coarse` with group 1."""
-        parts = []
-        for x in responses:
-            if coarse and self.coarse is self.drives:
-                parts.append(x.unflatten(-1, (-1, self.group)).mean(-1, keepdim=True))
-                continue
-            if coarse:
-                later = torch.cat([x[..., 1:], x[..., -1:]], -1)
-                x = torch.lerp(x, later, (self.group - 1) / (2 * self.group))
-            parts.append(x.unflatten(-1, (-1, 1 if coarse else self.group)))
-        whole = parts[0] if len(parts) == 1 else torch.cat(parts, -2)
+    def at_counted_rows(self, responses: Sequence[Tensor]) -> Float[FloatArray, "*column counted group"]:
+        """Responses by drive, (..., time) each, at counted rows: (..., counted, group)."""
+        whole = torch.cat([x.unflatten(-1, (-1, self.group)) for x in responses], -2)
         return whole.numpy()[..., self.source, :]
-
-    @cached_property
-    def fingerprint(self) -> str:
-        """Of the data, to the bit: what a stored fit belongs to."""
-        return fingerprint(self)
-
-    @cached_property
-    def shared_columns(self) -> dict[tuple[type, bool], FloatArray]:
-        """What hypotheses over this record share: what an integrated effect does, at every row or as groups' means.
-
-        `(class, coarse)` to (knot, channel, counted, group); filled by the first hypothesis that needs them.
-        """
-        return {}
 
     @cached_property
     def measured(self) -> Float[FloatArray, "channel counted group"]:

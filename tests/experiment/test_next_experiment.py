@@ -9,28 +9,43 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.experiment import Limits, ManoeuvrePrediction, information, library, next_experiment, write_table
 from avtorch.experiment.prediction import responses
 from avtorch.gap import Effect, plant
 from avtorch.gap.answer.verdict import Candidate, verdict_of
-from avtorch.gap.drive_record import Record
 from avtorch.gap.effects import AerodynamicDrag, ConstantResistance, DeadBand, GainChange, RoadGrade, SensorBias
-from avtorch.gap.likelihood.noise_draws import noise_draws
-from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.likelihood import band_covariance
 from avtorch.gap.result.diagnosis import Diagnosis, GapSize, LogFacts
+from avtorch.gap.result.noise_spectrum import NoiseSpectrum
 from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.gap.result.sentences import to_drive
-from avtorch.io import Log
 from tests.bars import BAR
+from tests.gap.records import log_of
 
 BOTH = ("accel", "speed")
-NOISE = NoiseModel(process_sd=0.04, accel_sd=0.06, speed_sd=0.03)
+
+
+def usual_noise() -> NoiseSpectrum:
+    """Forces of 0.04 m/s² within 0.35 s and 0.01 m/s² within 3 s, sensors' noise of 0.06 m/s² and 0.03 m/s, by rows of
+    0.05 s."""
+    frequency = np.geomspace(0.02, 9.9, 80)
+    turn, dt = 2 * np.pi * frequency, 0.05
+    force = sum(2 * sd**2 * time / (1 + (turn * time) ** 2) for sd, time in ((0.04, 0.35), (0.01, 3.0))) / dt
+    covariance = np.repeat(force, 4).reshape(-1, 2, 2)
+    covariance[:, 0, 0] += 0.06**2
+    covariance[:, 1, 1] += (turn * 0.03) ** 2
+    return NoiseSpectrum(BOTH, frequency, covariance, 10.0)
+
+
+NOISE = usual_noise()
 
 
 def contender(
-    effects: list[Effect], *, spread: float = 0.01, rng: np.random.Generator, noise: NoiseModel = NOISE
+    effects: list[Effect], *, spread: float = 0.01, rng: np.random.Generator, noise: NoiseSpectrum = NOISE
 ) -> PredictiveModel:
     """Of a plant, its parameters known to a share of `spread`."""
     own = plant(effects, T_L=0.4, K_L=0.9)
@@ -49,25 +64,29 @@ def left(rivals: list[PredictiveModel], shares: list[float]) -> Diagnosis:
     return Diagnosis(log, {}, GapSize(True), tuple(each), verdict, contenders=tuple(rivals))
 
 
+def sensors_noise(data: DriveData, rows: int, rng: np.random.Generator) -> FloatArray:
+    """Coefficients of white noise of 0.06 m/s² and 0.02 m/s, of means of `rows` rows."""
+    each = [sd / np.sqrt(rows) * rng.standard_normal(len(data.time)) for sd in (0.06, 0.02)]
+    return data.transform(data.channel_rows(*each))
+
+
 @pytest.mark.statistical
-def test_draws_of_the_noise_are_white_to_its_own_filter(rotating_seed: int, draws_factor: int) -> None:
+@pytest.mark.parametrize(("rate_hz", "group"), [(20, 1), (60, 3), (200, 10)])
+def test_the_noise_of_a_log_is_carried_over_to_a_manoeuvres_rows(rate_hz: int, group: int, rotating_seed: int) -> None:
+    """Means have an n-th of the noise, and a difference over longer steps sees less of what is fast."""
     rng = np.random.default_rng(rotating_seed)
-    noise = NoiseModel(0.05, 0.4, 0.04, 2.5, 0.03, 0.02, sensor_scale=1.1, sensor_lag=0.2)
-    time = np.arange(0.0, 60.0, 0.05)
-    speed = 10 + np.sin(0.3 * time)
-    log = Log.from_arrays(time=time, accel_cmd=0.3 * np.cos(0.3 * time), accel=0.3 * np.cos(0.3 * time), speed=speed)
-    record = Record.of(log)
-    white = WhiteningFilter(record, noise)(
-        noise_draws(noise, len(time), 0.05, BOTH, 40 * draws_factor, rng)[..., record.source, None]
-    )
-    # a steady filter begins cold, and is settled within a second
-    white = white[:, :, 20:]
-    size = white[:, 0].size
-    # squares of standard normals have variance 2
-    for k in (0, 1):
-        assert (white[:, k] ** 2).mean() == pytest.approx(1.0, abs=BAR * np.sqrt(2 / size))
-        lagged = (white[:, k, 1:] * white[:, k, :-1]).mean()
-        assert lagged == pytest.approx(0.0, abs=BAR / np.sqrt(size))
+    log, manoeuvre = (DriveData.of(log_of(seconds=300.0, rate_hz=rate, noise=None)) for rate in (rate_hz, 20))
+    h = Hypothesis(log)
+    h.covariance = band_covariance(log, sensors_noise(log, log.group, rng))
+    told = NoiseSpectrum.of(h).at(manoeuvre, group)
+    drawn = band_covariance(manoeuvre, sensors_noise(manoeuvre, group, rng))
+    bands, edges = manoeuvre.band_size, manoeuvre.band_edges[:-1]
+    told = np.add.reduceat(told, edges, axis=0) / np.diff(manoeuvre.band_edges)[:, None, None]
+    fast = manoeuvre.frequency[edges] > 0.5  # the first bands are too wide for one value of what rises so steeply
+    for c in (0, 1):
+        off = np.log(told[fast, c, c] / drawn[fast, c, c])
+        # both are estimated, of about as many coefficients
+        assert (np.abs(off) < BAR * np.sqrt(4 / bands[fast]) + 0.02).all()
 
 
 @pytest.mark.statistical
@@ -77,7 +96,7 @@ def test_margin_is_half_the_square_of_the_distance(rotating_seed: int) -> None:
     rivals = [contender([], spread=1e-6, rng=rng), contender([SensorBias(0.02)], spread=1e-6, rng=rng)]
     foretold = [ManoeuvrePrediction.of(r, m, BOTH, 1, 64) for r in rivals]
     law = foretold[0].law(0)
-    away = law._white((foretold[1].law(0).mean - law.mean)[None])
+    away = law.whitened((foretold[1].law(0).mean - law.mean)[None])
     distance = float(np.linalg.norm(away))
     expected = information(foretold, 0, [0.5, 0.5], seed=rotating_seed)
     # the log odds of 32 examples are normal with this mean and a standard deviation of `distance`; a median of them
@@ -141,12 +160,13 @@ def test_an_unknown_road_widens_the_prediction(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     hilly = contender([RoadGrade(0.02)], rng=rng)
     m = library()[:1]
-    law = ManoeuvrePrediction.of(hilly, m, BOTH, 1, 32).law(0)
+    foretold = ManoeuvrePrediction.of(hilly, m, BOTH, 1, 32)
+    law = foretold.law(0)
     flat = ManoeuvrePrediction.of(replace(hilly, grade_rms=None), m, BOTH, 1, 32).law(0)
     assert len(law.spread) > len(flat.spread)
     push = 9.81 * 0.02 * np.sin(0.02 * m[0].time)
-    pushed = law.mean + np.stack([push, np.cumsum(push) * 0.05])
-    assert law.log_density(pushed[None])[0] > flat.log_density(pushed[None])[0] + 20
+    pushed = law.mean + foretold.coefficients(np.stack([push, np.cumsum(push) * 0.05])[None])
+    assert law.log_density(pushed)[0] > flat.log_density(pushed)[0] + 20
 
 
 def test_a_gain_that_has_changed_stays_changed(fresh_seed: int) -> None:

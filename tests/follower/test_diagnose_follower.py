@@ -70,7 +70,7 @@ def test_a_gap_changed_midway_gets_a_wide_interval(rotating_seed: int) -> None:
     both = replace(near, time=time, segment=np.repeat([0, 1], [near.rows, far.rows]), engaged=np.ones(len(time), bool))
     candidate = followed(replace(both, **columns), LAWS["constant_time_gap"])
     found = identified(candidate)
-    wide = widened(found, candidate.record)
+    wide = widened(found)
     assert (np.diag(wide) >= np.diag(found.covariance)).all()
     assert (np.linalg.eigvalsh(wide) > 0).all()
     # the two are 0.6 s apart; each time gap is identified to 0.01 s
@@ -179,8 +179,8 @@ def test_drives_that_begin_their_time_anew_keep_their_own_rows(
     monkeypatch.setattr(sys.modules[diagnose_follower.__module__], "diagnose", only_look)
     found = diagnose_follower(whole, law="constant_time_gap")
     (late,) = given
-    # half of the rows that count, all in the last drive; the first two seconds of a drive do not count
-    assert late.rows == (rows[1] + rows[2] - 40) // 2
+    # half of the rows in which the car follows, all in the last drive
+    assert late.rows == (rows[1] + rows[2]) // 2
     np.testing.assert_array_equal(late.spacing, whole.spacing[-late.rows :])
     own = {k.removeprefix("law."): torch.tensor(v) for k, v in found.identified.values.items() if k.startswith("law.")}
     seen = FollowerMeasurements(

@@ -1,8 +1,9 @@
-"""Logs and rollout errors drawn from the diagnosis' own noise model, by formulas that share nothing with its filter."""
+"""Logs of a car with noise of a usual kind: forces that wander, and white sensors."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,11 +11,25 @@ import torch
 from avtorch.arrays import FloatArray
 from avtorch.gap import GapPlant, SimulatorInput, plant
 from avtorch.gap.drive_record import Record
-from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.io import Log
 
 BOTH = ("accel", "speed")
-QUIET = NoiseModel(force_sd=0.005)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Two Ornstein-Uhlenbeck forces, jerk noise behind the lag and a gust, by size [m/s²] and time [s]; `accel_sd`
+    [m/s²] and `speed_sd` [m/s] of white sensors."""
+
+    process_sd: float = 0.05
+    process_time: float = 0.35
+    force_sd: float = 0.01
+    force_time: float = 3.0
+    accel_sd: float = 0.05
+    speed_sd: float = 0.02
+
+
+QUIET = Noise(force_sd=0.005)
 
 
 def command_over(time: FloatArray) -> FloatArray:
@@ -28,7 +43,7 @@ def log_of(
     *,
     seconds: float = 60.0,
     rate_hz: int = 20,
-    noise: NoiseModel | None = QUIET,
+    noise: Noise | None = QUIET,
     rng: np.random.Generator | None = None,
     channels: Sequence[str] = BOTH,
     speed0: float = 18.0,
@@ -53,23 +68,13 @@ def log_of(
     return Log.from_arrays(name=name, time=time, accel_cmd=command, **{w: given[w] for w in channels})
 
 
-def drawn_errors(noise: NoiseModel, rows: int, dt: float, rng: np.random.Generator) -> FloatArray:
+def drawn_errors(noise: Noise, rows: int, dt: float, rng: np.random.Generator) -> FloatArray:
     """Errors (2, rows) of acceleration and speed, the Ornstein-Uhlenbeck processes and their integrals exact."""
     p, w = np.zeros(rows), np.zeros(rows)
     for sd, lag in ((noise.process_sd, noise.process_time), (noise.force_sd, noise.force_time)):
         moved, gained = ornstein(sd, lag, rows, dt, rng)
         p, w = p + moved, w + gained
     return np.stack([p + noise.accel_sd * rng.standard_normal(rows), w + noise.speed_sd * rng.standard_normal(rows)])
-
-
-def errors_of(noise: NoiseModel, record: Record, rng: np.random.Generator) -> FloatArray:
-    """(channel, counted, 1) drawn from `noise`, every stretch by itself, from any speed."""
-    parts = []
-    for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
-        drawn = drawn_errors(noise, last - first, record.dt, rng)
-        drawn[1] += rng.standard_normal()
-        parts.append(drawn)
-    return np.concatenate(parts, 1)[[BOTH.index(w) for w in record.channels], :, None]
 
 
 def ornstein(sd: float, lag: float, rows: int, dt: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -97,25 +102,6 @@ def covariance(sd: float, lag: float, time: FloatArray) -> FloatArray:
     )
     both = 2 * lag * np.minimum(t, s) - lag**2 * (1 - np.exp(-t / lag) - np.exp(-s / lag) + between)
     return sd**2 * np.block([[between, lag * mixed], [lag * mixed.T, both]])
-
-
-def dense_covariance(
-    noise: NoiseModel, time: FloatArray, channels: Sequence[str] = BOTH, *, offset_sd: float = 0.0
-) -> FloatArray:
-    """Covariance of the errors of `channels`, one after another, at `time` of one stretch."""
-    n = len(time)
-    whole = covariance(noise.process_sd, noise.process_time, time - time[0])
-    whole = whole + covariance(noise.force_sd, noise.force_time, time - time[0])
-    whole[:n, :n] += noise.accel_sd**2 * np.eye(n)
-    whole[n:, n:] += noise.speed_sd**2 * np.eye(n) + offset_sd**2
-    use = np.concatenate([np.arange(n) + n * BOTH.index(w) for w in channels])
-    return whole[np.ix_(use, use)]
-
-
-def log_normal_density(x: FloatArray, covariance: FloatArray) -> float:
-    root = np.linalg.cholesky(covariance)
-    z = np.linalg.solve(root, x)
-    return float(-0.5 * z @ z - np.log(np.diag(root)).sum() - 0.5 * len(x) * np.log(2 * np.pi))
 
 
 def record_of(seconds: float, **options: object) -> Record:

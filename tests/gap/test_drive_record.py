@@ -10,7 +10,7 @@ import pytest
 from avtorch.errors import InputError
 from avtorch.gap import plant
 from avtorch.gap.drive_record import Record
-from avtorch.gap.likelihood.hypothesis import Hypothesis
+from avtorch.gap.rollout_errors import rolled_out
 from avtorch.io import Log
 from tests.gap.records import log_of
 
@@ -41,55 +41,25 @@ def test_rows_are_averaged_down_to_some_twenty_a_second(rate_hz: int, group: int
     assert record.measured.shape == (2, record.rows, group)
     # all but the first two seconds, in which the actuator's state is not known
     np.testing.assert_allclose(record.time[record.source[[0, -1]]], [2.0, record.time[-1]], atol=1e-9)
-    assert Record.of(log, rate_hz=1e9).group == 1
 
 
-def test_drives_are_rolled_out_at_the_logs_rate_coarse_ones_at_the_groups(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    short = Record.of(log_of(seconds=20.0, rate_hz=100))
-    assert short.coarse is short.drives
-    monkeypatch.setattr("avtorch.gap.drive_record._FEW", 0)
+def test_drives_are_rolled_out_at_the_logs_rate() -> None:
     log = log_of(seconds=20.0, rate_hz=100)
-    record = Record.of(log)
-    (fine,), (coarse,) = record.drives, record.coarse
-    assert len(fine.time) == log.rows
-    assert len(coarse.time) == log.rows // 5
-    assert fine.uniform
-    assert coarse.uniform
-    np.testing.assert_array_equal(fine.command.numpy(), log.accel_cmd)
-    single = Record.of(log_of(seconds=20.0, rate_hz=20))
-    assert single.coarse[0] is single.drives[0]
+    (drive,) = Record.of(log).drives
+    assert len(drive.time) == log.rows
+    assert drive.uniform
+    np.testing.assert_array_equal(drive.command.numpy(), log.accel_cmd)
 
 
 @pytest.mark.parametrize("rate_hz", [20, 40, 100])
 def test_the_truth_leaves_nothing_over(rate_hz: int) -> None:
     car = plant(T_L=0.4, K_L=0.9)
     record = Record.of(log_of(car, seconds=40.0, rate_hz=rate_hz, noise=None))
-    hypothesis = Hypothesis.named(record, "none", plant())
-    z = hypothesis.z_of({"T_L": 0.4, "K_L": 0.9})[None]
-    errors = hypothesis.errors(z)[0]
+    errors = record.measured - rolled_out(record, car)
     # the first acceleration, taken from 0.3 s, is forgotten within some lags; what it added to the speed is not
     assert np.abs(errors[0]).max() < 2e-2
     assert np.abs(np.diff(errors[1], axis=0)).max() < 2e-3
     assert np.abs(errors[:, errors.shape[1] // 2 :] - errors[:, -1:, -1:]).max() < 1e-6
-
-
-@pytest.mark.parametrize("rate_hz", [50, 100])
-def test_coarse_responses_are_close_to_the_groups_means(rate_hz: int) -> None:
-    car = plant(T_L=0.4, K_L=0.9)
-    record = Record.of(log_of(car, seconds=40.0, rate_hz=rate_hz, noise=None))
-    hypothesis = Hypothesis.named(record, "none", plant())
-    z = hypothesis.z_of({"T_L": 0.4, "K_L": 0.9})[None]
-    means = hypothesis.rollouts(z).mean(-1, keepdims=True)
-    coarse = hypothesis.rollouts(z, coarse=True)
-    assert coarse.shape == means.shape
-    # within a group the exponential is taken for a straight line, and a step of the command for its mean
-    jumps = np.abs(np.diff(record.command)).max()
-    assert np.abs(coarse - means)[:, 0].max() < 0.5 * jumps * record.dt / 0.4
-    assert np.sqrt(((coarse - means)[:, 0] ** 2).mean()) < 0.01
-    speeds = (coarse - means)[0, 1] - (coarse - means)[0, 1, :1]
-    assert np.abs(speeds).max() < 0.02
 
 
 def _stretches(record: Record) -> list[tuple[float, float]]:
@@ -116,7 +86,7 @@ def test_standstill_and_a_drivers_foot_do_not_count() -> None:
     # rollouts run on through the standstill, and not through the override
     ends = [d.time[[0, -1]].tolist() for d in record.drives]
     np.testing.assert_allclose(ends, [(0, 19.975), (24.5, 59.975)], atol=1e-6)
-    assert record.segment == (0, 0)
+    assert [cut.segment for cut in record.cuts] == [0, 0]
 
 
 def test_a_group_with_one_row_that_does_not_count_does_not_count() -> None:
@@ -136,10 +106,6 @@ def test_one_row_in_the_drivers_hand_ends_a_drive_at_whole_groups() -> None:
     record = Record.of(replace(log, engaged=engaged))
     assert [cut.rows for cut in record.cuts] == [slice(0, 1500), slice(1504, 2999)]
     np.testing.assert_allclose(_stretches(record), [(2, 14.95), (17.04, 29.94)], atol=1e-6)
-    # single rows of the same drives are where the groups place them
-    raw = Record.of(replace(log, engaged=engaged), rate_hz=1e9, multiple=record.group)
-    np.testing.assert_allclose(raw.time[record.source * record.group], record.time[record.source])
-    assert set((record.source[:, None] * record.group + np.arange(record.group)).ravel()) <= set(raw.source)
 
 
 def test_short_stretches_are_left_out() -> None:
@@ -150,12 +116,10 @@ def test_short_stretches_are_left_out() -> None:
     )
 
 
-def test_segments_are_drives_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avtorch.gap.drive_record._FEW", 0)
+def test_segments_are_drives_of_their_own() -> None:
     log = log_of(seconds=60.0, rate_hz=100)
     record = Record.of(_cut(log, slice(0, 1503), slice(1600, 4004), slice(4400, 5950)))
     assert [len(d.time) for d in record.drives] == [1500, 2400, 1550]
-    assert [len(d.time) for d in record.coarse] == [300, 480, 310]
     np.testing.assert_allclose(_stretches(record), [(2, 14.95), (18, 39.95), (46, 59.45)], atol=1e-6)
     # measured and rolled out stand at the same rows
     seen = record.at_counted_rows([d.command for d in record.drives])
@@ -170,11 +134,8 @@ def test_several_logs_are_one_after_another() -> None:
     alone = [Record.of(a), Record.of(b)]
     assert record.rows == sum(r.rows for r in alone)
     np.testing.assert_array_equal(record.measured, np.concatenate([r.measured for r in alone], 1))
-    hypothesis = Hypothesis.named(record, "none", plant())
-    z = np.zeros((2, 2))
-    together = hypothesis.rollouts(z)
-    parts = [Hypothesis.named(r, "none", plant()).rollouts(z) for r in alone]
-    np.testing.assert_allclose(together, np.concatenate(parts, 2), atol=1e-9)
+    parts = [rolled_out(r, plant()) for r in alone]
+    np.testing.assert_allclose(rolled_out(record, plant()), np.concatenate(parts, 1), atol=1e-9)
     np.testing.assert_array_equal(Record.of(iter([a])).source, alone[0].source)
 
 

@@ -44,7 +44,6 @@ class CommandHold(Effect):
     random = True
     meaning = "messages are lost and the last command is held"
     equation = "u of the last row that arrived"
-    searched_as = "losses"
     noise_parameters = fixed(loss="hold_fraction")
     parameters = (
         Parameter(

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,9 +16,6 @@ from avtorch.gap.simulator.effect import Effect, fixed, register
 from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
-
-_CHANGES = 12  # initial values of the change time over a drive
-_MOMENTS = 60  # change times tried one at a time
 
 
 @register
@@ -84,17 +80,6 @@ class GainChange(Effect):
         since = row.time - tensor(self.change_s)
         share = (_area(since + row.dt, ramp) - _area(since, ramp)) / row.dt
         return 1 + (tensor(self.gain_ratio) - 1) * share, 1.0
-
-    @classmethod
-    def starts_in(cls, first: float, last: float) -> Mapping[str, tuple[float, ...]]:
-        times = first + (last - first) * (np.arange(_CHANGES) + 0.5) / _CHANGES
-        return {"gain_ratio": (0.85, 1.15), "change_s": tuple(times.tolist()), "ramp_s": (1.0, 0.12 * (last - first))}
-
-    @classmethod
-    def retried_in(cls, first: float, last: float) -> Mapping[str, tuple[float, ...]]:
-        """Change times to try one at a time: many, because in a quiet drive only a few of them are visible."""
-        moments = torch.linspace(first, last, _MOMENTS + 2)[1:-1].tolist()
-        return {**cls.starts, "change_s": tuple(moments)}
 
     def values_after_onset(self) -> Mapping[str, float]:
         return {"change_s": -1e3, "ramp_s": 0.0}

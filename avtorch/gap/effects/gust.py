@@ -46,7 +46,6 @@ class Gust(Effect):
     meaning = "wind and road push the car at random, for seconds"
     equation = "df = -f / tau dt + sd sqrt(2 / tau) dW"
     slow_force = True
-    searched_as = "force"
     noise_parameters = fixed(force_sd="sd_mps2", force_time="time_constant_s")
     parameters = (
         Parameter("sd_mps2", "m/s²", 0.0, 0.1, 0.4, possible=(0.0, 0.6), beyond="wind and road do not do this"),

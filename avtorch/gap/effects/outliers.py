@@ -49,7 +49,6 @@ class Outliers(Effect):
     meaning = "single samples of the accelerometer are far off"
     equation = "a + scale sigma e, with probability fraction"
     commutes = True
-    searched_as = "tails"
     noise_parameters = fixed(tail_fraction="fraction", tail_scale="scale")
     parameters = (
         Parameter(

@@ -21,8 +21,6 @@ from avtorch.vehicle.arguments import Number, tensor
 
 GRAVITY = 9.80665
 """[m/s²]"""
-_PER_KNOT = 20  # places of which a mean over the way is taken
-_SMOOTH_KNOTS = 2.25  # knots to a correlation length, in a road whose knots are spaced
 
 
 @register
@@ -103,34 +101,6 @@ class RoadGrade(Integrated):
         lower = _lower(self.knots, self.knot_m, self.smooth_m)
         return -GRAVITY * _spline(position, lower.T, self.knot_m, True).movedim(0, -1)
 
-    def force(self, position: Tensor, coefficients: Tensor) -> Tensor:
-        """Acceleration (..., time) of a grade, linear in its `coefficients` (..., knot); `position` (time,) [m]."""
-        lower = _lower(self.knots, self.knot_m, self.smooth_m)
-        return -GRAVITY * _spline(position, coefficients @ lower.T, self.knot_m, True)
-
-    def magnitude(self, position: Tensor, coefficients: Tensor) -> Tensor:
-        """The grade [-]."""
-        return self.force(position, coefficients) / GRAVITY
-
-    def size_along(self, position: Tensor) -> Tensor:
-        """The root mean square grade [-] over `position` (time,) [m]; its constant part is a force and no grade."""
-        grade = tensor(self.grade_rms)[..., None] * _spline(position, self._coefficients(), self.knot_m, True)
-        return grade.std(-1, correction=0)
-
-    def levelled(self, coefficients: Tensor) -> Tensor:
-        """`coefficients` (..., knot) of the same road without its mean slope."""
-        lower = _lower(coefficients.shape[-1], self.knot_m, self.smooth_m)
-        flat = torch.linalg.solve_triangular(lower, torch.ones_like(lower[:, :1]), upper=False)[:, 0]
-        mean = coefficients @ (lower.T @ _along_the_way(lower.shape[-1]))
-        return coefficients - mean[..., None] * flat
-
-    def spaced(self, knot_m: float) -> Self:
-        return replace(self, knot_m=knot_m, smooth_m=_SMOOTH_KNOTS * knot_m)
-
-    def along(self, coefficients: Tensor, size: float) -> Self:
-        profile = coefficients / size
-        return replace(self, grade_rms=size, profile=profile, knots=len(profile))
-
     def _coefficients(self) -> Tensor:
         profile = tensor(self.profile)
         return profile @ _lower(profile.shape[-1], self.knot_m, self.smooth_m).T
@@ -154,13 +124,6 @@ def _spline(position: Tensor, coefficients: Tensor, knot: float, whole: bool) ->
             value = value if whole else value[..., 0]
         total = total + weight / 6 * value
     return total
-
-
-@lru_cache(maxsize=16)
-def _along_the_way(knots: int) -> Tensor:
-    """What each of so many splines adds to the mean over the way (knot,). The first and last hardly reach into it."""
-    place = torch.linspace(0, knots - 3, _PER_KNOT * (knots - 3) + 1, dtype=torch.float64)
-    return _spline(place, torch.eye(knots, dtype=torch.float64), 1.0, True).mean(-1)
 
 
 @lru_cache(maxsize=16)

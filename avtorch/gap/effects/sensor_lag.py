@@ -43,7 +43,6 @@ class SensorLag(Effect):
     meaning = "the accelerometer lags the car's acceleration"
     equation = "s' = (a - s) / lag"
     alias = "pole"
-    reading = fixed(lag="lag_s")
     starts = fixed(lag_s=(0.03, 0.1, 0.2, 0.4))
     parameters = (
         Parameter(

@@ -37,7 +37,6 @@ class SensorScale(Effect):
     meaning = "the accelerometer's gain is wrong"
     equation = "scale a"
     alias = "K_L"
-    reading = fixed(scale="scale")
     starts = fixed(scale=(0.95, 1.05))
     parameters = (
         Parameter("scale", "-", 1.0, 0.83, 1.2, possible=(0.5, 2.0), beyond="no accelerometer has that scale error"),

@@ -94,6 +94,12 @@ class Weight:
     slow: str
     outliers: bool
 
+    @property
+    def process_noise(self) -> float:
+        """White jerk behind the actuator [m/s³/√Hz]: what is left of it where there is a gust."""
+        slow = self.composition.slow
+        return slow.process_noise_beside_gust if self.slow == "gust" else slow.process_noise
+
 
 @dataclass(frozen=True, eq=False)
 class ModelAverage:
@@ -307,8 +313,8 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
         if x.mirror:
             labels += _echoes(x, names)
         if c.form:
-            beside = names if h.force is not None and names else None
-            labels = [(beside, -UNKNOWN_NATS)] + [
+            # beside names it is a part without one; alone it is the cause
+            labels = [(names or None, -UNKNOWN_NATS)] + [
                 (label, worth + shape_log_odds(c.relative, c.nats, h.effects)) for label, worth in labels
             ]
         total, kinds = dict(c.total), SLOW

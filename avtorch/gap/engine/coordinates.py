@@ -165,7 +165,9 @@ EFFECTS: dict[str, EngineEffect] = {
     e.name: e
     for e in (
         EngineEffect(
-            "dead_time", (_sized("dead_time", "dead_time", "delay_s", "value", 0, 1.5),), ((0.06,), (0.2,), (0.4,), (0.8,))
+            "dead_time",
+            (_sized("dead_time", "dead_time", "delay_s", "value", 0, 1.5),),
+            ((0.06,), (0.2,), (0.4,), (0.8,)),
         ),
         EngineEffect(
             "dead_band",
@@ -207,14 +209,14 @@ EFFECTS: dict[str, EngineEffect] = {
             "speed_dependent_lag",
             (_sized("lag_slope", "speed_dependent_lag", "lag_slope", "value", -2.5, 2.5),),
             ((0.3,), (-0.3,), (-0.8,), (0.8,)),
-            "never",
+            "may",
             _SPEED,
         ),
         EngineEffect(
             "speed_dependent_gain",
             (_sized("gain_slope", "speed_dependent_gain", "gain_slope", "value", -2, 2),),
             ((0.2,), (-0.2,)),
-            "never",
+            "may",
             _SPEED,
         ),
         EngineEffect(
@@ -264,7 +266,7 @@ EFFECTS: dict[str, EngineEffect] = {
                 _nuisance("wind", "wind_mps", 0.0, 3.0, -12.0, 12.0),
             ),
             ((4e-4, 0.0), (4e-4, 5.0)),
-            "never",
+            "may",
             _SPEED,
         ),
         EngineEffect(
@@ -276,7 +278,7 @@ EFFECTS: dict[str, EngineEffect] = {
             "low_speed_creep",
             (_sized("creep", "low_speed_creep", "creep_mps2", "value", 0, 3),),
             ((0.3,),),
-            "never",
+            "may",
             _SPEED,
         ),
         EngineEffect(

@@ -86,7 +86,7 @@ class SlowForces:
     """Slow forces in a residual, at the maximum over their grids.
 
     `log_likelihood` [nats] of process noise alone, its prior included, over the lowest `bands` bands; `gust`, `road`
-    [nats]: what either gains over it, the difference of priors included. `process_noise` [m/s³/√Hz]; `gust_sd`,
+    [nats]: what either gains over it, the difference of priors included. `process_noise` [m/s³/√Hz] alone; `gust_sd`,
     `road_sd` [m/s²]; `gust_time` [s]; `road_length` [m]: the best of each grid.
 
     `process_power`, `gust_power` (band,) [(m/s²)²] at the best gust; `covariance` (band, channel, channel) and `counts`
@@ -96,6 +96,7 @@ class SlowForces:
     log_likelihood: float
     bands: int
     process_noise: float
+    process_noise_beside_gust: float
     gust: float
     gust_sd: float
     gust_time: float
@@ -334,6 +335,7 @@ def slow_forces(
         log_likelihood=base,
         bands=bands,
         process_noise=size,
+        process_noise_beside_gust=float(sizes[g0]),
         gust=gust,
         gust_sd=float(SIZE_GRID_MPS2[g1]),
         gust_time=float(GUST_TIME_GRID_S[g2]),

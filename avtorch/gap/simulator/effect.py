@@ -19,10 +19,10 @@ The defaults suit an ordinary effect:
 
 | used by                 | declared by                                            | default                         |
 |-------------------------|--------------------------------------------------------|---------------------------------|
-| search: initial values  | `starts`; of a drive `starts_in`, `retried_in`         | typical sizes, and one sd lower |
+| search: initial values  | `starts`                                               | typical sizes                   |
 | search: onset           | `own_onset`; `values_after_onset`                      | any row is tried                |
-| search: randomness      | `noise`; `searched_as`, `noise_parameters`, `in_noise` | fitted by its `noise`           |
-| likelihood              | `reading`; `integrated.Integrated`                     | the accelerometer has no error  |
+| search: randomness      | `noise`; `noise_parameters`, `in_noise`                | a law like one of the table     |
+| experiments             | `integrated.Integrated`                                | nothing is unknown along a road |
 | actuator                | `actuator_parameters`                                  | first order, no rate limit      |
 | aliases: which          | `alias`, `aliased`, `constant_accel`, `force_sign`     | no equivalent effect            |
 | aliases: in combination | `slow_force`, `commutes`                               | its force follows the command   |
@@ -54,7 +54,6 @@ from avtorch.vehicle.broadcasting import broadcast
 Place = Literal["command", "actuator", "body", "sensor"]
 Alias = Literal["offset", "pole", "K_L"]
 """The effect's equivalent in the measured acceleration: a constant, one more real pole, or a factor."""
-SearchedAs = Literal["force", "tails", "losses"]
 PLACES: tuple[Place, ...] = ("command", "actuator", "body", "sensor")
 """Places in the chain, in its order.
 
@@ -85,9 +84,8 @@ class NoiseChange:
     `command_variance` (..., time) [(m/s²)²]: mean square difference between the command acting in a row and the one
     logged there, independent from row to row.
 
-    The diagnosis uses it to find the effect: its parameters are fitted together with those of the hypothesis and of the
-    noise, by the likelihood under the changed noise. An effect to be tested returns one of the three: a force, tails,
-    or a command's variance.
+    The diagnosis finds a user's random effect by it: as the gust or the outliers of the table that it is like. An
+    effect to be tested returns one of the two: a force or tails.
 
     Example:
         >>> import torch
@@ -117,11 +115,8 @@ class Effect:
     the parameter [s] that is its onset; no other onset is tried. `of_the_drive`: its parameters belong to a drive and
     not to the car, so it is no placebo in a cross-validation.
 
-    Randomness. `searched_as`: the dedicated search of a random effect, which also finds an onset; a derived class does
-    not inherit it. `noise_parameters`: its parameters by their names in this search (`force_sd` and `force_time`,
-    `tail_fraction` and `tail_scale`, or `loss`).
-
-    Sensor. `reading`: its parameter for `"lag"` [s] or `"scale"` [-], where it also applies to the car's random motion.
+    Randomness. `noise_parameters`: its parameters by their names in `NoiseChange` (`force_sd` and `force_time`,
+    `tail_fraction` and `tail_scale`), or `loss`.
 
     Aliases, where the log has no speed. `alias`: effects with the same value respond alike, as far as `aliased` and
     `force_sign` allow; one with `"K_L"` is not observable there. `force_sign`: the only possible sign of its force, 0:
@@ -164,9 +159,7 @@ class Effect:
     starts: ClassVar[Mapping[str, tuple[float, ...]]] = fixed()
     own_onset: ClassVar[str | None] = None
     of_the_drive: ClassVar[bool] = False
-    searched_as: ClassVar[SearchedAs | None] = None
     noise_parameters: ClassVar[Mapping[str, str]] = fixed()
-    reading: ClassVar[Mapping[str, str]] = fixed()
     alias: ClassVar[Alias | None] = None
     force_sign: ClassVar[Literal[-1, 0, 1]] = 0
     slow_force: ClassVar[bool] = False
@@ -206,7 +199,7 @@ class Effect:
 
     # around it -----------------------------------------------------------------------------------------------------
     def noise(self, u: Tensor) -> NoiseChange | None:
-        """Change of the noise model under commands `u` (..., time), by which a random effect's evidence is computed.
+        """Change of the noise model under commands `u` (..., time), by which a random effect is found.
 
         None for a deterministic effect.
         """
@@ -230,16 +223,6 @@ class Effect:
         return {}
 
     @classmethod
-    def starts_in(cls, first: float, last: float) -> Mapping[str, tuple[float, ...]]:
-        """Initial values for a drive from `first` to `last` [s]."""
-        return cls.starts
-
-    @classmethod
-    def retried_in(cls, first: float, last: float) -> Mapping[str, tuple[float, ...]]:
-        """Values tried for one parameter at a time, after the others have converged."""
-        return cls.starts
-
-    @classmethod
     def aliased(cls, values: Mapping[str, float]) -> bool:
         """Whether it responds as its `alias` states, at these `values` of its parameters and of `T_L` [s]."""
         return True
@@ -251,11 +234,6 @@ class Effect:
         Where they are unknown, any number of the only possible sign. None where it is not known to be constant.
         """
         return None
-
-    @classmethod
-    def own_search(cls) -> SearchedAs | None:
-        """`searched_as`, only if this very class declares it: a derived class is a user's own effect."""
-        return vars(cls).get("searched_as")
 
     @classmethod
     def in_words(cls, values: Mapping[str, float]) -> str:

@@ -6,7 +6,7 @@ Its one parameter in the answer, `size`, scales all of them. A hypothesis has at
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -31,27 +31,3 @@ class Integrated(Effect):
     def columns(self, position: Tensor) -> Tensor:
         """Acceleration (time, knot) per unit of each coefficient at size 1, `position` (time,) [m]."""
         raise NotImplementedError(f"{type(self).__name__} has no columns")
-
-    def force(self, position: Tensor, coefficients: Tensor) -> Tensor:
-        """Acceleration (..., time) of `coefficients` (..., knot), linear in them; `position` (time,) [m]."""
-        raise NotImplementedError(f"{type(self).__name__} has no force")
-
-    def magnitude(self, position: Tensor, coefficients: Tensor) -> Tensor:
-        """The quantity whose root mean square is the size, (..., time), linear too, with the same arguments."""
-        raise NotImplementedError(f"{type(self).__name__} has no magnitude")
-
-    def size_along(self, position: Tensor) -> Tensor:
-        """The size that the coefficients have over these places: a root mean square, (...); `position` (time,) [m]."""
-        raise NotImplementedError(f"{type(self).__name__} has no size_along")
-
-    def levelled(self, coefficients: Tensor) -> Tensor:
-        """`coefficients` (..., knot) without the part that makes the same force everywhere."""
-        return coefficients
-
-    def spaced(self, knot_m: float) -> Self:
-        """The effect with knots `knot_m` [m] apart, and as smooth as these can follow."""
-        return self
-
-    def along(self, coefficients: Tensor, size: float) -> Self:
-        """The effect with this `size`, and `coefficients` (knot,) at size 1."""
-        raise NotImplementedError(f"{type(self).__name__} has no along")

@@ -124,11 +124,6 @@ class GapPlant:
         effects = [e.prepared(time, *flat) if e.name in own else e for e in self.effects]
         return GapPlant(effects, T_L=self.T_L, K_L=self.K_L, sigma=self.sigma, seed=self.seed)
 
-    def kept(self, kind: type[Effect]) -> Effect | None:
-        """The plant's own effect of that kind, whose settings a fit keeps, so that its parameters and `K_L` mean what
-        they meant before. None where it has none, or one that is of a drive."""
-        return next((e for e in self.effects if type(e) is kind and not kind.of_the_drive), None)
-
     def report(self) -> dict[str, dict[str, Tensor]]:
         """Parameters by effect, under the answer's names."""
         return {e.name: e.report(tensor(self.T_L)) for e in self.effects}

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
@@ -99,31 +98,6 @@ class SimulatorInput:
         accel0 = None if log.accel is None or steady_start else float(log.accel[rows][0])
         time, command = torch.as_tensor(log.elapsed[rows]), torch.as_tensor(log.accel_cmd[rows])
         return cls(time, command, speed, accel0, log.accel_kind == "specific-force")
-
-    def cut(self, row: int) -> tuple[SimulatorInput, SimulatorInput]:
-        """The rows up to `row`, and those from it on. The last cut is kept: a fit comes back to its onset."""
-        if row not in self._last_cut:
-            self._last_cut.clear()
-            with torch.inference_mode(False):  # also for a later rollout with derivatives
-                self._last_cut[row] = self._part(slice(0, row + 1)), self._part(slice(row, None))
-        return self._last_cut[row]
-
-    @cached_property
-    def _last_cut(self) -> dict[int, tuple[SimulatorInput, SimulatorInput]]:
-        return {}
-
-    def _part(self, rows: slice) -> SimulatorInput:
-        speed = None if self.speed is None else self.speed[..., rows]
-        position0 = 0.0 if self.position is None else self.position[..., rows][..., 0]
-        time, command = self.time[rows], self.command[..., rows]
-        return replace(self, time=time, command=command, speed=speed, position0=position0)
-
-
-class Place(NamedTuple):
-    """A row of one of several drives."""
-
-    drive: int
-    row: int
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,11 @@ from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, Effect, Parameter, plant
 from avtorch.gap.answer.plausibility import implausible
 from avtorch.gap.effects import Gust, SensorLag
-from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.plant import BASELINE
 from avtorch.report import report_html
-from tests.gap.records import log_of
+from tests.gap.records import Noise, log_of
 
 
 def about(mean: float, share: float = 0.05) -> Quantity:
@@ -44,7 +43,7 @@ def said_everywhere(found: Diagnosis, reason: str) -> None:
 @pytest.fixture(scope="module")
 def shaken() -> Diagnosis:
     """A car that something pushes far harder than wind and road do."""
-    log = log_of(plant(T_L=0.4, K_L=0.9), noise=NoiseModel(force_sd=1.9, force_time=1.5), speed0=40.0)
+    log = log_of(plant(T_L=0.4, K_L=0.9), noise=Noise(force_sd=1.9, force_time=1.5), speed0=40.0)
     return avtorch.diagnose(log, effects=["gust"], pairs=False)
 
 
@@ -72,7 +71,7 @@ def test_a_gain_of_a_sixteenth_is_remarked() -> None:
 
 @pytest.mark.slow
 def test_a_usual_gust_is_not() -> None:
-    log = log_of(plant(T_L=0.4, K_L=0.9), noise=NoiseModel(force_sd=0.3, force_time=1.5))
+    log = log_of(plant(T_L=0.4, K_L=0.9), noise=Noise(force_sd=0.3, force_time=1.5))
     found = avtorch.diagnose(log, effects=["gust"], pairs=False)
     assert found.verdict.names == ("gust",)
     assert found.to_dict()["verdict"] | {"plausible": True, "plausibility": None} == found.to_dict()["verdict"]

@@ -20,7 +20,6 @@ from avtorch.blindtest.vehicle import Run, simulate
 from avtorch.errors import InputError
 from avtorch.gap import AerodynamicDrag, RoadGrade, SensorLag, SimulatorInput, plant
 from avtorch.gap.drive_record import Record
-from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.io import Log
 from tests.gap.records import log_of
 
@@ -76,14 +75,8 @@ def test_the_kind_travels_with_the_log() -> None:
     assert log[0:100].accel_kind == "specific-force"
     record = Record.of(log)
     assert record.accel_kind == "specific-force"
-    assert all(d.specific_force for d in (*record.drives, *record.coarse))
+    assert all(d.specific_force for d in record.drives)
     assert SimulatorInput.from_log(log).specific_force
-    columns = [Hypothesis(Record.of(x), (RoadGrade,), plant()).grade_columns for x in (log, log_of(seconds=20.0))]
-    assert columns[0] is not None
-    assert columns[1] is not None
-    assert not columns[0][:, 0].any()
-    assert columns[0][:, 1].any()
-    assert columns[1][:, 0].any()
     with pytest.raises(InputError, match="different kinds of accel"):
         Record.of([log, replace(log, accel_kind="kinematic")])
     with pytest.raises(InputError, match="accel_kind: found 'gravity'"):

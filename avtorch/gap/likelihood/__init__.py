@@ -1,1 +1,0 @@
-"""Likelihood of a log under a hypothesis: records, whitened residuals, modes and log evidence."""
