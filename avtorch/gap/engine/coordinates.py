@@ -172,10 +172,10 @@ EFFECTS: dict[str, EngineEffect] = {
         EngineEffect(
             "dead_band",
             (_sized("dead_band", "dead_band", "half_width_mps2", "value", 0, 1.5),),
-            ((0.05,), (0.2,)),
+            ((0.05,), (0.2,), (0.5,)),
         ),
         EngineEffect(
-            "backlash", (_sized("backlash", "backlash", "half_width_mps2", "value", 0, 1.5),), ((0.05,), (0.2,))
+            "backlash", (_sized("backlash", "backlash", "half_width_mps2", "value", 0, 1.5),), ((0.05,), (0.2,), (0.5,))
         ),
         EngineEffect(
             "saturation",

@@ -19,7 +19,7 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, EngineEffect, base_name
 from avtorch.gap.engine.evidence import evaluate_evidence
 from avtorch.gap.engine.force_base import prices, resized, with_force_map
-from avtorch.gap.engine.gauss_newton import fit, linearised, objective, whitened_jacobian
+from avtorch.gap.engine.gauss_newton import fit, linearised, normal_prior, objective, whitened_jacobian
 from avtorch.gap.engine.gear_shifts import refined_shift_speeds, shift_speeds, upshift_rows
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import log_likelihood, whiten
@@ -330,12 +330,14 @@ class _Projection:
         x = np.concatenate([whitened, np.zeros(self.rows)])
         return x - self._basis @ (self._basis.T @ x)
 
-    def nats(self, free: FloatArray) -> float:
-        """What the best multiple of a projected response gains, its size penalised by a unit prior; the noise's
+    def nats(self, free: FloatArray, e: EngineEffect, start: Sequence[float]) -> float:
+        """What the best multiple of a projected response gains, its size penalised by the effect's prior; the noise's
         covariance is that of what is left, as everywhere: a band's own excess does not hide what explains it."""
         gain, size = float(free @ self.residual), float(free @ free)
-        shares = gain / (size + 1), gain / max(size, 1e-9)
-        return max(self._nats(self.residual - x * free) - 0.5 * x * x for x in shares) - self._start
+        sds = [normal_prior(c.name, 0.0)[1] for c in e.coordinates if c.faint]
+        precision = sum((x / sd) ** 2 for x, sd in zip(start, sds, strict=False))
+        shares = gain / (size + 1), gain / (size + precision + 1e-9)
+        return max(self._nats(self.residual - x * free) - 0.5 * precision * x * x for x in shares) - self._start
 
     def _nats(self, x: FloatArray) -> float:
         data = self._data
@@ -390,7 +392,7 @@ def _whole(
     if size <= 1e-6 * float(whitened @ whitened) or (gain <= 0 and e.one_sided):
         return []
     turned = start if gain > 0 or e.name == "driveline_oscillation" else tuple(-x for x in start)
-    return [Promise(projection.nats(free), e.name, turned, None)]
+    return [Promise(projection.nats(free, e, start), e.name, turned, None)]
 
 
 def _by_slope(h: Hypothesis, projection: _Projection, e: EngineEffect, start: tuple[float, ...]) -> list[Promise]:
@@ -403,7 +405,7 @@ def _by_slope(h: Hypothesis, projection: _Projection, e: EngineEffect, start: tu
     change = (h.response(p) - h.predicted) * (start[0] / _SLOPES[name])
     free = projection(whiten(h.data, h.covariance, change))
     gain = float(free @ projection.residual)
-    return [Promise(projection.nats(free), e.name, start, None)] if gain > 0 else []
+    return [Promise(projection.nats(free, e, start), e.name, start, None)] if gain > 0 else []
 
 
 def _onsets(
@@ -451,7 +453,7 @@ def _onsets(
         if n > 1e-9 and (gain > 0 or not e.one_sided):
             share = float(np.clip(gain / n, -4, 4)) if len(start) == 1 or e.onset == "must" else 1.0
             scaled = (share * start[0], *start[1:])
-            out.append(Promise(projection.nats(free) - price, e.name, scaled, onset))
+            out.append(Promise(projection.nats(free, e, start) - price, e.name, scaled, onset))
     return out
 
 
