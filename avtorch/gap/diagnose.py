@@ -35,7 +35,7 @@ from avtorch.gap.result.held_out import held_out_errors, nested
 from avtorch.gap.result.hypotheses import best_weight, candidates_of, first_onset, verdict, verdict_names
 from avtorch.gap.result.own_random import own_random, renamed
 from avtorch.gap.result.parameters import ParameterPosterior, base_quantities
-from avtorch.gap.result.parts import force_map_of, parts_of, said_of_map
+from avtorch.gap.result.parts import force_map_of, parts_of, said_of_unnamed
 from avtorch.gap.result.predictive_model import predictive_models
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import uncounted
@@ -178,7 +178,7 @@ def diagnose(
     if not complete and "unknown" not in said.alias_set:  # which stands for what was not tried
         said = replace(said, alias_set=(*said.alias_set, "unknown"))
     parts = parts_of(average, said.names, chosen, seed)
-    said = replace(said, why=" ".join(filter(None, (said.why, said_of_map(parts)))))
+    said = replace(said, why=" ".join(filter(None, (said.why, said_of_unnamed(parts)))))
     if named and force_map_of(parts) is not None:
         notes[_WITHOUT_MAP] = None
     if told is not None:

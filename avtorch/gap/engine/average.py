@@ -84,7 +84,10 @@ class Examined:
 
 @dataclass(frozen=True, eq=False)
 class Weight:
-    """One composition under one label: `log_weight` [nats] before tempering, `evidence` the same without odds."""
+    """One composition under one label: `log_weight` [nats] before tempering, `evidence` the same without odds.
+
+    `part`: the free form that is a part without a name; empty where there is none, or where it is an error of shape.
+    """
 
     label: str
     log_weight: float
@@ -93,6 +96,7 @@ class Weight:
     composition: Composition = field(repr=False)
     slow: str
     outliers: bool
+    part: str = ""
 
     @property
     def process_noise(self) -> float:
@@ -106,13 +110,15 @@ class ModelAverage:
     """Probabilities of labels ("none", "unknown", effects joined by "+" in alphabetical order), and what supports them.
 
     `probabilities` sum to 1, the most probable first; `best`: the strongest support of each label. `force_maps`:
-    probability of each form of a force map in the base, by its name.
+    probability of each form of a force map in the base, by its name; `parts`: of each free form as a part without a
+    name.
     """
 
     probabilities: Mapping[str, float]
     best: Mapping[str, Weight]
     examined: tuple[Examined, ...]
     force_maps: Mapping[str, float] = field(default_factory=dict)
+    parts: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
@@ -205,11 +211,13 @@ def average(
     total: dict[str, list[float]] = {"none": [], "unknown": []}
     best: dict[str, Weight] = {}
     bases: dict[str, list[float]] = {}
+    forms: dict[str, list[float]] = {}
     for w in weights:
         given = _given(w.label, prior or {})
         total.setdefault(w.label, []).append(TEMPER * w.log_weight + given)
         force = w.examined.hypothesis.force
         bases.setdefault("" if force is None else force.name, []).append(total[w.label][-1])
+        forms.setdefault(w.part, []).append(total[w.label][-1])
         if w.label not in best or best[w.label].log_weight < w.log_weight:
             best[w.label] = w
     logs = {label: log_sum(x) if x else -np.inf for label, x in total.items()}
@@ -220,9 +228,8 @@ def average(
     listed = {k: max(v, _LEAST_LISTED) for k, v in listed.items()}
     whole = sum(listed.values())
     ordered = sorted(listed.items(), key=lambda kv: -kv[1])
-    each = {form: log_sum(x) for form, x in bases.items()}
-    maps = {form: math.exp(x - log_sum(list(each.values()))) for form, x in each.items() if form}
-    return ModelAverage({k: v / whole for k, v in ordered}, best, tuple(examined), maps)
+    chances = {k: v / whole for k, v in ordered}
+    return ModelAverage(chances, best, tuple(examined), _shares(bases), _shares(forms))
 
 
 # inside ---------------------------------------------------------------------------------------------------------------
@@ -230,6 +237,13 @@ def _renamed(w: Weight, nameless: Collection[str]) -> str:
     """The weight's label without names; with a force map, what has no other name is unknown."""
     left = "+".join(n for n in w.label.split("+") if n not in nameless)
     return left or ("none" if w.examined.hypothesis.force is None else "unknown")
+
+
+def _shares(logs: Mapping[str, list[float]]) -> dict[str, float]:
+    """Probabilities of what has a name, from logarithms of weights by name."""
+    each = {name: log_sum(x) for name, x in logs.items()}
+    whole = log_sum(list(each.values()))
+    return {name: math.exp(x - whole) for name, x in each.items() if name}
 
 
 def _given(label: str, prior: Mapping[str, float]) -> float:
@@ -322,7 +336,8 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
             large = c.slow.gust_sd > _LARGE_OF_COMMAND * h["K_L"] * float(np.std(h.data.command))
             kinds = ("gust",) if large and total["gust"] > total["none"] + SLOW_FORCE_NATS else ("none",)
             total["none"] = max(total["none"], total["gust"] - SLOW_FORCE_NATS)
-        for slow, (label, worth) in itertools.product(kinds, labels):
+        for slow, (number, (label, worth)) in itertools.product(kinds, enumerate(labels)):
+            part = c.form if number == 0 else ""
             value = odds + worth
             if slow != "none":
                 sd = c.slow.gust_sd if slow == "gust" else c.slow.road_sd
@@ -337,7 +352,7 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
                 if causes is not None and (causes or outliers or h.force is None):
                     text = "+".join(sorted([*causes, *(["outliers"] if outliers else [])])) or "none"
                 evidence = total[slow] + (spike if outliers else 0.0)
-                yield Weight(text, total[slow] + value + more, evidence, x, c, slow, outliers)
+                yield Weight(text, total[slow] + value + more, evidence, x, c, slow, outliers, part)
 
 
 def _echoes(x: Examined, names: list[str]) -> list[tuple[list[str] | None, float]]:

@@ -1,4 +1,4 @@
-"""The parts of an answer: named effects, and the force map of the car as a part without a name.
+"""The parts of an answer: named effects, and the force map of the car and other free forms as parts without a name.
 
 A part is where a cause acts, its family, before it is a name. Its size is what it does to the car's acceleration, so
 that sizes of parts compare; shares of the gap are the budget's.
@@ -37,6 +37,15 @@ FAMILIES = {
     "chance": ("gust", "outliers", "command_hold"),
 }
 """Where each effect acts."""
+FORMS = {
+    "linear": ("dynamics", "other linear dynamics"),
+    "sided": ("dynamics", "lags that depend on the sign of the command"),
+    "tone": ("dynamics", "a steady tone"),
+    "map": ("force map", "a force map"),
+    "gain": ("time", "a gain that wanders"),
+    "delay": ("time", "a delay that wanders"),
+}
+"""Where each free form acts, and what it is."""
 _DRAWS = 400
 
 
@@ -74,7 +83,8 @@ class AnswerPart:
 def parts_of(
     average: ModelAverage, names: Sequence[str], posterior: ParameterPosterior, seed: int = 0
 ) -> tuple[AnswerPart, ...]:
-    """The named parts of the verdict, in its order, and then the force map; `posterior`: of the verdict's weight."""
+    """The named parts of the verdict, in its order, then the force map and the other free forms, the likeliest first;
+    `posterior`: of the verdict's weight."""
     parts = [
         AnswerPart(name, _family(name), None, _size(posterior, name), part_probability(average, name))
         for name in names
@@ -86,19 +96,24 @@ def parts_of(
         h = weight.examined.hypothesis
         form = max(average.force_maps, key=lambda name: average.force_maps[name])
         parts.append(AnswerPart(None, "force map", form, map_size(h, seed), present, h.force_map))
+    for form, probability in sorted(average.parts.items(), key=lambda kv: -kv[1]):
+        if probability >= LEAST_LISTED:
+            parts.append(AnswerPart(None, FORMS[form][0], form, None, probability))
     return tuple(parts)
 
 
 def force_map_of(parts: Sequence[AnswerPart]) -> ForceMap | None:
     """The force map of parts in which it is likely."""
-    return next((p.force_map for p in parts if p.name is None and p.probability >= LIKELY), None)
+    return next((p.force_map for p in parts if p.force_map is not None and p.probability >= LIKELY), None)
 
 
-def said_of_map(parts: Sequence[AnswerPart]) -> str:
-    """A sentence on the force map where it is likely, else nothing."""
-    part = next((p for p in parts if p.force_map is not None and p.probability >= LIKELY), None)
-    if part is None or part.size_mps2 is None:
+def said_of_unnamed(parts: Sequence[AnswerPart]) -> str:
+    """A sentence on the likely part without a name, else nothing."""
+    part = next((p for p in parts if p.name is None and p.probability >= LIKELY), None)
+    if part is None:
         return ""
+    if part.size_mps2 is None:
+        return f"A part without a name is {FORMS[str(part.form)][1]} (probability {part.probability:.2g})."
     of = "speed" if part.form == "R(v)" else "command and speed"
     return (
         f"A part without a name is the force map {part.form}: the car's force differs from K u by "
