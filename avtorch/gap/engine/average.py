@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from avtorch.gap.engine.coordinates import EFFECTS, base_name
+from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name
 from avtorch.gap.engine.free_forms import block, families, mirror_columns, tone, wandering
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import log_sum
@@ -156,7 +156,7 @@ def examine(h: Hypothesis, search: Search) -> Examined:
         forms["linear"] = forms["linear"]._replace(nats=forms["linear"].nats - mirror)
     forms |= wandering(h)
     lags = pulling_lags(h)
-    first = slow_forces(data, h.residual, h.values, lags=lags)
+    first = slow_forces(data, h.residual, _from_the_start(h), lags=lags)
     steady = tone(h, 0.1 if max(first.gust, first.road) < 30 else 0.4).fit
     forms["tone"] = steady._replace(nats=steady.nats - 5)
     exact = h.evidence - log_sum(h.shape_log)
@@ -262,6 +262,15 @@ def _acts(h: Hypothesis) -> bool:
     return all(EFFECTS[e].size(h.values, h.neutral) > 0.1 for e in h.effects)
 
 
+def _from_the_start(h: Hypothesis) -> np.ndarray:
+    """Values (parameter,) of what acts through the whole drive."""
+    values = h.values.copy()
+    for e in h.onsets:
+        for c in EFFECTS[e].coordinates:
+            values[INDEX[c.name]] = h.neutral[INDEX[c.name]]
+    return values
+
+
 def _composed(
     h: Hypothesis, form: str, nats: float, residual: np.ndarray, exact: float, lags: np.ndarray, least: float = -np.inf
 ) -> Composition | None:
@@ -280,7 +289,7 @@ def _composed(
         given = band_covariance(data, residual)
         if shape is not None:
             given = np.ascontiguousarray(shape.covariances[k]), shape.counts[k]
-        found = slow_forces(data, residual, h.values, given=given, lags=lags)
+        found = slow_forces(data, residual, _from_the_start(h), given=given, lags=lags)
         covariance, counts = given
         n = found.bands
         free = -0.5 * float((counts[:n] * (np.linalg.slogdet(covariance[:n])[1] + data.channel_count)).sum())

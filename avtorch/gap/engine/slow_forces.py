@@ -90,7 +90,8 @@ class SlowForces:
     `road_sd` [m/s²]; `gust_time` [s]; `road_length` [m]: the best of each grid.
 
     `process_power`, `gust_power` (band,) [(m/s²)²] at the best gust; `covariance` (band, channel, channel) and `counts`
-    (band,) are what was explained.
+    (band,) are what was explained; `sensor` (band, channel, channel): factors by which a covariance becomes that before
+    a sensor that lags or has another scale.
     """
 
     log_likelihood: float
@@ -107,6 +108,7 @@ class SlowForces:
     gust_power: FloatArray = field(repr=False)
     covariance: FloatArray = field(repr=False)
     counts: FloatArray = field(repr=False)
+    sensor: FloatArray = field(repr=False)
 
 
 # spectra --------------------------------------------------------------------------------------------------------------
@@ -295,7 +297,8 @@ def slow_forces(
     frequency, energy = band_response(data)
     bands = len(energy)
     covariance, counts = band_covariance(data, residual) if given is None else given
-    covariance, counts = np.ascontiguousarray(covariance[:bands]), np.asarray(counts[:bands], float)
+    sensor = _before_the_sensor(data, values, bands)
+    covariance, counts = np.ascontiguousarray(covariance[:bands] * sensor), np.asarray(counts[:bands], float)
 
     def nats(power: FloatArray) -> FloatArray:
         """(...,) of powers (..., band)."""
@@ -346,6 +349,7 @@ def slow_forces(
         gust_power=SIZE_GRID_MPS2[g1] ** 2 * gusts[g2],
         covariance=covariance,
         counts=counts,
+        sensor=sensor,
     )
 
 
@@ -374,7 +378,7 @@ def gust_onset(data: DriveData, residual: FloatArray, found: SlowForces) -> tupl
     edges = data.band_edges[: bands + 1]
     low = residual[:, :, : edges[-1]]
     products = np.moveaxis(np.add.reduceat(low[:, None] * low, edges[:-1], axis=-1), 2, 0)  # frame, C, C, band
-    before = np.moveaxis(np.cumsum(products, axis=0), -1, 1) / np.diff(edges)[:, None, None]
+    before = np.moveaxis(np.cumsum(products, axis=0), -1, 1) / np.diff(edges)[:, None, None] * found.sensor
     cuts = np.arange(max(int(ONSET_SHARES[0] * frames), 3), min(int(ONSET_SHARES[1] * frames), frames - 3) + 1)
     n = np.diff(edges) * cuts[:, None].astype(float)
     m = np.diff(edges) * (frames - cuts[:, None].astype(float))
@@ -390,6 +394,26 @@ def gust_onset(data: DriveData, residual: FloatArray, found: SlowForces) -> tupl
 
 
 # inside ---------------------------------------------------------------------------------------------------------------
+def _before_the_sensor(data: DriveData, values: FloatArray, bands: int) -> FloatArray:
+    """Factors (band, channel, channel) of a covariance: what pushes the car passes the accelerometer's lag and scale.
+
+    Of a common power P the accelerometer shows P |H|², and P Re H together with the speed; for one pole both are
+    P / (1 + w² tau²).
+    """
+    out = np.ones((bands, data.channel_count, data.channel_count))
+    if data.channel_count == 2:
+        w = (
+            2
+            * np.pi
+            * 0.5
+            * (data.frequency[data.band_edges[:bands]] + data.frequency[data.band_edges[1 : bands + 1] - 1])
+        )
+        lagged, scale = 1 + (w * values[INDEX["sensor_lag"]]) ** 2, 1 + values[INDEX["sensor_scale"]]
+        out[:, 0, 0] = lagged / scale**2
+        out[:, 0, 1] = out[:, 1, 0] = lagged / scale
+    return out
+
+
 def _tones(bin_hz: float) -> FloatArray:
     """Tones (tone,) [Hz] on which spectra are integrated, of bins so far apart.
 

@@ -259,3 +259,18 @@ def test_an_actuator_at_its_limit_pulls_less() -> None:
         assert np.allclose(lags, T_L * (1 + shares[-1] * (2.0 ** np.arange(len(lags)) - 1)))
     assert shares[0] == pytest.approx(0, abs=1e-9)
     assert 0.2 < shares[1] < shares[2] < 1
+
+
+@pytest.mark.statistical
+def test_process_noise_behind_a_sensor_that_lags_is_no_gust(rotating_seed: int) -> None:
+    rng, data = np.random.default_rng(rotating_seed), _data(900)
+    force, lag_s, scale = _process_noise(rng, len(data.time), 0.15), 0.4, 0.3
+    keep = np.exp(-1 / (RATE_HZ * lag_s))
+    felt = (1 + scale) * lfilter([1 - keep], [1, -keep], force)
+    residual = _residual(data, rng, force)
+    residual[0] += data.transform([felt - force, force])[0]
+    values = NEUTRAL.copy()
+    values[[INDEX["sensor_lag"], INDEX["sensor_scale"]]] = lag_s, scale
+    # a likelihood ratio against what is true exceeds x nats in exp(-x) of all drives; the grids leave some more
+    assert slow_forces(data, residual, values).gust < 8
+    assert slow_forces(data, residual, NEUTRAL).gust > 20  # a sensor that is taken for a good one
