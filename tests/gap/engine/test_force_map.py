@@ -214,7 +214,8 @@ def test_a_true_command_has_no_map(seed: int) -> None:
 def test_an_answer_says_its_parts() -> None:
     log = bent(log_of([DeadTime(DELAY)], seconds=90.0, seed=1))
     answer = diagnose(log, effects=["dead_time"], pairs=False)
-    (delay, force) = answer.to_dict()["parts"]
+    delay, force, *faint = answer.to_dict()["parts"]
+    assert all(part["name"] is None and part["probability"] < 0.5 for part in faint)
     assert (delay["name"], delay["family"], delay["form"]) == ("dead_time", "dynamics", None)
     assert (force["name"], force["family"], force["form"]) == (None, "force map", "F(u, v)")
     assert force["probability"] > 0.9
