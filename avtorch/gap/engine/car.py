@@ -79,6 +79,9 @@ def compiled(baseline: GapPlant) -> bool:
             return False
         if effect.name in ("gear_shift", "gain_change", "speed_dependent_gain", "speed_dependent_lag"):
             return False
+        coordinates = {c.parameter for c in own.coordinates}
+        if any(f.name not in coordinates and getattr(effect, f.name) != f.default for f in fields(effect)):
+            return False  # a setting that no coordinate has
     return True
 
 

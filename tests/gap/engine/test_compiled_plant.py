@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from avtorch import Log
-from avtorch.gap.engine.car import plant_of
+from avtorch.gap import AerodynamicDrag, DrivelineOscillation, Effect, SecondOrderActuator, plant
+from avtorch.gap.engine import car
 from avtorch.gap.engine.coordinates import EFFECTS, FROM_THE_START, INDEX
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
@@ -66,7 +67,7 @@ def _by_the_simulator(h: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
         torch.as_tensor(grid.speed),
         float(grid.accel0[0]),
     )
-    response = plant_of(h).response(drive)
+    response = car.plant_of(h).response(drive)
     return response.accel_measured.numpy(), (response.speed - response.speed[0]).numpy()
 
 
@@ -94,3 +95,28 @@ def test_a_gain_that_has_always_been_changed_is_another_gain():
     other[INDEX["K_L"]] *= 0.7
     for changed, plain in zip(h.on_grid(values, onsets), h.on_grid(other, onsets), strict=True):
         assert np.abs(changed - plain).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        DrivelineOscillation(2.2, 0.3),
+        DrivelineOscillation(2.2, 0.3, quadrature=0.2),
+        DrivelineOscillation(2.2, 0.3, mode_damping=0.2),
+        SecondOrderActuator(0.2, lag_ratio=0.5),
+        AerodynamicDrag(4e-4, 3.0),
+    ],
+    ids=repr,
+)
+def test_a_users_baseline_has_all_its_settings(effect: Effect):
+    simulator = plant([effect], T_L=0.37, K_L=0.93)
+    h = Hypothesis(_data(1), neutral=car.neutral_of(simulator), baseline=None if car.compiled(simulator) else simulator)
+    h.values = h.neutral.copy()
+    grid = h.data.grid
+    drive = SimulatorInput(
+        torch.as_tensor(grid.time),
+        torch.as_tensor(h.data.command[grid.row]),
+        torch.as_tensor(grid.speed),
+        float(grid.accel0[0]),
+    )
+    np.testing.assert_allclose(h.on_grid()[0], simulator.response(drive).accel_measured.numpy(), atol=1e-9)
