@@ -154,6 +154,14 @@ def _nuisance(name: str, parameter: str, mean: float, sd: float, low: float, hig
     return Coordinate(name, parameter, "value", low, high, sd, mean=mean)
 
 
+def _lasting(name: str, effect: str, parameter: str) -> Coordinate:
+    """The logarithm of a time, normal: its typical range holds four fifths; from a tenth of its end to hours."""
+    of = next(p for p in TABLE[effect].parameters if p.name == parameter)
+    low, high = math.log(of.low), math.log(of.high)
+    mean, sd = 0.5 * (low + high), (high - low) / 2.56
+    return Coordinate(name, parameter, "log", low - math.log(10), math.log(1e4), sd, mean=mean)
+
+
 _SPEED, _ACCEL, _BOTH = frozenset({"speed"}), frozenset({"accel"}), frozenset({"accel", "speed"})
 _RING = tuple((0.3, f) for f in (1.0, 1.25, 1.6, 2.0, 2.5, 3.0, 3.6, 4.4))
 
@@ -223,7 +231,7 @@ EFFECTS: dict[str, EngineEffect] = {
             "gain_change",
             (
                 _sized("gain_step", "gain_change", "gain_ratio", "less one", -0.9, 4),
-                Coordinate("gain_ramp", "ramp_s", "log", -3.0, 8.0, 1.9, mean=1.7),  # 0.5 to 60 s
+                _lasting("gain_ramp", "gain_change", "ramp_s"),
             ),
             ((0.2, 0.0),),
             "must",

@@ -451,8 +451,8 @@ def _onsets(
         free = projection(whiten(data, h.covariance, h.response(values, acts) - h.predicted))
         n, gain = float(free @ free), float(free @ projection.residual)
         if n > 1e-9 and (gain > 0 or not e.one_sided):
-            share = float(np.clip(gain / n, -4, 4)) if len(start) == 1 or e.onset == "must" else 1.0
-            scaled = (share * start[0], *start[1:])
+            alone = sum(bool(c.faint) for c in e.coordinates) == 1  # the first one is the size, the others its shape
+            scaled = (start[0] * float(np.clip(gain / n, -4, 4)), *start[1:]) if alone else start
             out.append(Promise(projection.nats(free, e, start) - price, e.name, scaled, onset))
     return out
 
