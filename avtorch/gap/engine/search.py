@@ -336,7 +336,7 @@ class _Projection:
         gain, size = float(free @ self.residual), float(free @ free)
         sds = [normal_prior(c.name, 0.0)[1] for c in e.coordinates if c.faint]
         precision = sum((x / sd) ** 2 for x, sd in zip(start, sds, strict=False))
-        shares = gain / (size + 1), gain / (size + precision + 1e-9)
+        shares = gain / (size + 1), gain / max(size, 1e-9)
         return max(self._nats(self.residual - x * free) - 0.5 * precision * x * x for x in shares) - self._start
 
     def _nats(self, x: FloatArray) -> float:

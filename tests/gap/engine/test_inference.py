@@ -17,15 +17,18 @@ from avtorch import diagnose
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest.drives import Recorded
 from avtorch.errors import InputError
-from avtorch.gap import DeadTime, GainChange, SensorBias
+from avtorch.gap import DeadTime, DrivelineOscillation, GainChange, SensorBias
+from avtorch.gap.engine.coordinates import EFFECTS
 from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.evidence import evaluate_evidence
 from avtorch.gap.engine.inference import infer
+from avtorch.gap.engine.search import promises
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.effect import Effect
 from avtorch.io import Log
 from tests.bars import BAR
 from tests.gap.cars import log_of
-from tests.gap.engine.recorded import recorded_log
+from tests.gap.engine.recorded import fitted_hypothesis, recorded_log
 
 DELAY, BIAS, RECORDER_S = 0.25, 0.3, 0.02
 FEW = ("dead_time", "constant_resistance", "sensor_bias")
@@ -73,6 +76,32 @@ def test_a_gain_that_fades_is_one_change(rotating_seed: int) -> None:
     fading = GainChange(gain_ratio=0.65, change_s=40.0, ramp_s=30.0, latest_s=120.0)
     found = found_in(recorded_log([fading], seconds=120.0, seed=rotating_seed), [*FEW, "gain_change"])
     says(found, "gain_change", {"gain_ratio": 0.65})
+
+
+@pytest.mark.statistical
+def test_a_ring_has_its_size(rotating_seed: int) -> None:
+    ringing = DrivelineOscillation(2.2, 0.6)
+    found = found_in(recorded_log([ringing], seconds=60.0, seed=rotating_seed), [*FEW, "driveline_oscillation"])
+    says(found, "driveline_oscillation", {"amplitude": 0.6, "frequency_hz": 2.2})
+
+
+def test_a_larger_effect_promises_more() -> None:
+    """A promise begins from a small size; a size of many times that is no less likely for it."""
+
+    def promised(bias: float) -> float:
+        base = evaluate_evidence(fitted_hypothesis(recorded_log([SensorBias(bias)], seconds=60.0)))
+        return max(p.nats for p in promises(base, [EFFECTS["sensor_bias"]]) if p.onset is None)
+
+    assert 0 < promised(0.1) < promised(0.3) < promised(0.9)
+
+
+def test_effects_that_set_in_together_pay_for_one_moment() -> None:
+    base = fitted_hypothesis(recorded_log([SensorBias(BIAS)], seconds=60.0))
+    evaluate_evidence(base)
+    with_bias = base.with_effect("sensor_bias", (BIAS,), 30.01).evaluate()
+    together, apart = (with_bias.with_effect("sensor_scale", (0.05,), t) for t in (30.01, 30.02))  # in one row
+    one, two = (evaluate_evidence(h.evaluate()).evidence for h in (together, apart))
+    assert one - two == pytest.approx(np.log(base.data.frame_count), abs=1e-6)
 
 
 @pytest.mark.slow

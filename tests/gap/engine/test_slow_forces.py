@@ -274,3 +274,16 @@ def test_process_noise_behind_a_sensor_that_lags_is_no_gust(rotating_seed: int) 
     # a likelihood ratio against what is true exceeds x nats in exp(-x) of all drives; the grids leave some more
     assert slow_forces(data, residual, values).gust < 8
     assert slow_forces(data, residual, NEUTRAL).gust > 20  # a sensor that is taken for a good one
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("q", [0.128, 0.147])
+def test_the_size_of_process_noise_is_not_rounded_to_a_grid(q: float, rotating_seed: int) -> None:
+    """A power that is a fifth too small or too large would pass for a gust in a long drive."""
+    rng, data = np.random.default_rng(rotating_seed), _data(900)
+    residual = _residual(data, rng, _process_noise(rng, len(data.time), q))
+    found = slow_forces(data, residual, NEUTRAL)
+    below = band_covariance(data, residual)[1][: found.bands].sum()
+    # a standard deviation from so many coefficients, of which the sensors leave a quarter
+    assert abs(found.process_noise / q - 1) < BAR / np.sqrt(2 * below / 4)
+    assert found.gust < 8
