@@ -22,6 +22,8 @@ from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.coordinates import EFFECTS, adopt, base_name
 from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.evidence import evaluate_evidence
+from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.inference import RANDOM, Inference, infer
 from avtorch.gap.engine.sample import sample
 from avtorch.gap.result import sentences
@@ -48,7 +50,7 @@ from avtorch.gap.whole_progress import WholeProgress
 from avtorch.io import Log, LogSource, as_logs
 from avtorch.io.mapping import Pairs
 
-_WITHOUT_MAP = "The repaired simulator has the named effects, not the force map; what is left is measured with it."
+_WITHOUT_MAP = "The repaired simulator does not carry the force map: it is fitted and measured without it."
 
 
 @shows_progress
@@ -153,11 +155,16 @@ def diagnose(
     mapped = weight.examined.hypothesis.force is not None
     top = weight if named or mapped or names == ("none",) else _likeliest(average)
     best = top.examined.hypothesis
+    repaired = _without_map(weight)
+    handed_back = ParameterPosterior(repaired, draws if repaired is weight else None, seed, random)
     if told is not None:
         told("held-out blocks", 0, 1)
     held = None
     if Blocks.of(inference.data) is not None:
-        held = held_out_errors(nested(none, weight.examined.hypothesis, inference.search.visited.values()))
+        visited = [h for h in inference.search.visited.values() if h.force is None]
+        full = weight.examined.hypothesis
+        mapped = None if full.force is None else full
+        held = held_out_errors(nested(none, repaired.examined.hypothesis, visited), mapped)
     budget = None
     if held is not None:
         budget = budget_of(
@@ -171,6 +178,7 @@ def diagnose(
             chance=[kind.name for kind in shown if kind.random],
         )
     if budget is not None:
+        budget = replace(budget, repaired=handed_back.moved())
         names = budget.verdict
     complete = inference.search.complete
     known = "known effect" if complete and len(kinds) >= len(chosen_effects(None)) else "effect tried"
@@ -192,7 +200,7 @@ def diagnose(
     lag_and_gain, assumed = base_quantities(none, seed)
     bare = _base_weight(inference)
     simulator = ParameterPosterior(bare).plant(base, bare.process_noise)
-    errors = [rows.errors(h) for h in (none, best)]
+    errors = [rows.errors(h) for h in (none, best, repaired.examined.hypothesis)]
     return Diagnosis(
         log=LogFacts.of(each),
         baseline=lag_and_gain,
@@ -208,9 +216,9 @@ def diagnose(
         onset_s=None if onset is None or names == ("none",) else onset.stamp_s,
         onset_from_start_s=None if onset is None or names == ("none",) else onset.from_start_s,
         onset_log=0 if onset is None else onset.log,
-        plant=chosen.plant(base, weight.process_noise) if named else None,
+        plant=handed_back.plant(base, weight.process_noise) if named else None,
         simulator=simulator,
-        belief=chosen.belief() if named else assumed,
+        belief=handed_back.belief() if named else assumed,
         assumed=assumed,
         draws=chosen.chains if named else None,
         where=()
@@ -218,7 +226,7 @@ def diagnose(
         else localise(attribution, onset_s=None if onset is None else onset.from_start_s, lag=none["T_L"]),
         shrinkage=shrinkage_of(held, seed) if held is not None and named else None,
         contenders=predictive_models(posteriors, said, base),
-        traces=_traces(each, rows, errors[0], errors[1] if named else errors[0], attribution),
+        traces=_traces(each, rows, errors[0], errors[2] if named else errors[0], attribution),
         remaining=given_dead_time(candidates, said, base),
         complete=complete,
         scope=scope,
@@ -259,6 +267,14 @@ def _likeliest(average: ModelAverage) -> Weight:
     """The strongest weight of a label with names."""
     named = [w for label, w in average.best.items() if label not in ("none", "unknown")]
     return max(named or average.best.values(), key=lambda w: w.log_weight)
+
+
+def _without_map(weight: Weight) -> Weight:
+    """The weight with its hypothesis as the repaired simulator has it: fitted without a force map."""
+    h = weight.examined.hypothesis
+    if h.force is None:
+        return weight
+    return replace(weight, examined=replace(weight.examined, hypothesis=evaluate_evidence(fit(h.without_map(), 12))))
 
 
 def _base_weight(inference: Inference) -> Weight:

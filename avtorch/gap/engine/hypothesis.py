@@ -157,6 +157,15 @@ class Hypothesis:
             other.lost = ()
         return other
 
+    def without_map(self) -> Self:
+        """The hypothesis without its force map, not evaluated; itself where it has none."""
+        if self.force is None:
+            return self
+        other = self.copy()
+        other.base, other.plain, other.force, other.force_coefficients = self.plain, None, None, np.zeros(0)
+        other.force_columns = other.force_spread = None
+        return other
+
     @property
     def reference_speed(self) -> float:
         """At which slopes with speed are neutral [m/s]."""

@@ -49,9 +49,9 @@ class HeldOut:
     """A chain of nested hypotheses on blocks that taught neither their parameters nor their noise.
 
     `steps`: scores of each hypothesis of `chain`; `floor`, `ceiling`: of the last and the first with a black box on top
-    (`black_box_rest`). `values` (hypothesis, fold, parameter): as each fold's other blocks teach them. `errors`,
-    `predicted` (channel, row) [m/s²]: of acceleration and differenced speed, what the last hypothesis leaves and what
-    the black box foretells of it. `horizon_s` of the free runs.
+    (`black_box_rest`), the floor that of a force map where that is lower. `values` (hypothesis, fold, parameter): as
+    each fold's other blocks teach them. `errors`, `predicted` (channel, row) [m/s²]: of acceleration and differenced
+    speed, what the last hypothesis leaves and what the black box foretells of it. `horizon_s` of the free runs.
     """
 
     chain: tuple[Hypothesis, ...]
@@ -81,8 +81,10 @@ class HeldOut:
         return np.asarray(frames * float(self.data.frame_rows), np.float64)
 
 
-def held_out_errors(chain: Sequence[Hypothesis]) -> HeldOut | None:
+def held_out_errors(chain: Sequence[Hypothesis], mapped: Hypothesis | None = None) -> HeldOut | None:
     """The scores of nested hypotheses, fitted to all blocks, the base first (`nested`).
+
+    `mapped`: the last with a force map, which the repaired simulator does not carry: what it leaves is a floor, too.
 
     None where the drives are too short for `FEWEST` blocks.
 
@@ -118,7 +120,7 @@ def held_out_errors(chain: Sequence[Hypothesis]) -> HeldOut | None:
         chain=tuple(chain),
         blocks=blocks,
         steps=tuple(scored),
-        floor=beside[0],
+        floor=beside[0] if mapped is None else _lower(beside[0], _alone(_taught(mapped, blocks), blocks)),
         ceiling=beside[1],
         values=np.stack([x.values for x in fitted]),
         errors=np.stack(compared(data, stitched[-1])),
@@ -132,10 +134,9 @@ def nested(base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis] = (
     """A chain from `base` to `full`, one more effect at a time, those without which free runs are worst first.
 
     From `full` on the effect leaves that free runs miss least, all others refitted; fits among `visited` are taken as
-    they are. What chance decides enters with the first effect. Runs are those of the fit: the order is no score. A
-    force map enters before all effects, which act in front of it.
+    they are. What chance decides enters with the first effect. Runs are those of the fit: the order is no score.
     """
-    known = {_key(h): h for h in visited if (h.force and h.force.name) == (full.force and full.force.name)}
+    known = {_key(h): h for h in visited}
     floor = _run_squares(full)
     chain = [full]
     while len(_sized(chain[-1])) > 1:
@@ -143,14 +144,11 @@ def nested(base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis] = (
         rest = {e: known.get(_key(now, e)) or _refitted(now, e) for e in _sized(now)}
         cost = {e: float((_run_squares(h) / floor).mean()) for e, h in rest.items()}
         chain.append(rest[min(cost, key=lambda e: cost[e])])
-    mapped = [full.base] if full.force is not None and full.base is not None else []
-    return [base, *mapped, *(reversed(chain) if _sized(full) else ())]
+    return [base, *(reversed(chain) if _sized(full) else ())]
 
 
 def entered(before: Hypothesis, after: Hypothesis) -> str:
-    """The effect, by the table's name, that one hypothesis has and the one before it has not; or "force map"."""
-    if before.force is None and after.force is not None:
-        return "force map"
+    """The effect, by the table's name, that one hypothesis has and the one before it has not."""
     return next(base_name(e) for e in _sized(after) if e not in before.effects)
 
 
@@ -235,6 +233,17 @@ def _refitted(h: Hypothesis, without: str) -> Hypothesis:
     if without == "dead_time":  # what was a delay is a lag now
         rest["T_L"] += 0.8 * h["dead_time"]
     return fit(rest, 6, 0.1)
+
+
+def _alone(x: _Taught, blocks: Blocks) -> Scores:
+    """Of a hypothesis by itself."""
+    return _scores(x.hypothesis.data, blocks, blocks.stitched(list(x.errors)), x.residuals, x.residuals)
+
+
+def _lower(a: Scores, b: Scores) -> Scores:
+    """The better of two in each channel, and in nats."""
+    less = (b.squares.sum(1) < a.squares.sum(1))[:, None]
+    return Scores(np.where(less, b.squares, a.squares), b.nats if b.nats.sum() > a.nats.sum() else a.nats)
 
 
 # scores --------------------------------------------------------------------------------------------------------------

@@ -90,7 +90,7 @@ def parts_of(
         for name in names
         if name not in ("none", "unknown")
     ]
-    present = sum(average.force_maps.values())
+    present = min(sum(average.force_maps.values()), 1.0)  # which rounding may exceed
     weight = _with_map(average, posterior.weight)
     if weight is not None and present >= LEAST_LISTED:
         h = weight.examined.hypothesis
