@@ -158,7 +158,8 @@ def budget(found: Findings) -> list[str]:
     """The sentence on the budget of the gap, and what it divides."""
     if found.budget is None or not found.budget.parts:
         return []
-    cut = "this effect cuts" if len(found.budget.names) == 1 else "these effects cut"
+    verb = "cut" if all(e.left < e.before for e in found.budget.by_channel.values()) else "take"
+    cut = f"this effect {verb}s" if len(found.budget.names) == 1 else f"these effects {verb}"
     told = found.budget.names == found.verdict.names and not found.verdict.partial
     line = [found.budget.beside_its_name() if told else str(found.budget)]
     line = [] if headline(found).endswith(str(found.budget)) else line
