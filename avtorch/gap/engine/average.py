@@ -40,7 +40,7 @@ from avtorch.gap.engine.slow_forces import SlowForces, band_covariance, gust_ons
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
 _EXAMINED = 8  # hypotheses that are examined in full
-_LINEAR = frozenset({"dead_time", "second_order_actuator", "sensor_lag"})
+_LINEAR = frozenset({"dead_time", "second_order_actuator", "sensor_lag", "driveline_oscillation"})
 _FAINT_GUST = FAINT_OF_RANGE * TABLE["gust"].parameters[0].low
 _LARGE_OF_COMMAND = 0.2  # a slow force has a name, with one channel, from this share of the command's spread on
 _LEAST_LISTED = 1e-4
@@ -365,12 +365,16 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
 
 
 def _echoes(x: Examined, names: list[str]) -> list[tuple[list[str] | None, float]]:
-    """Labels without linear dynamics whose gain is within that of the mirrored bank: theirs, or a loop's echo."""
+    """Labels without linear dynamics whose gain, one by one or of all together, is within that of the mirrored bank:
+    theirs, or a loop's echo."""
     h = x.hypothesis
     base = h.base or h
-    out: list[tuple[list[str] | None, float]] = []
-    for e in sorted(_LINEAR & set(names)):
-        gain = x.beside[e][1] if e in x.beside else h.evidence - base.evidence if len(h.effects) == 1 else None
-        if gain is not None and gain < x.mirror:
-            out.append(([n for n in names if n != e], EFFECT_NATS - max(gain, 0.0) ** 2 / x.mirror))
-    return out
+    linear = sorted(_LINEAR & set(names))
+    gains = {(e,): x.beside[e][1] for e in linear if e in x.beside}
+    if linear and len(linear) == len(h.effects):
+        gains[tuple(linear)] = h.evidence - base.evidence
+    return [
+        ([n for n in names if n not in some], len(some) * EFFECT_NATS - max(gain, 0.0) ** 2 / x.mirror)
+        for some, gain in gains.items()
+        if gain < x.mirror
+    ]

@@ -61,12 +61,13 @@ class DriveData:
     """Rows of one or several logs of one car, and the coefficients `measured` (channel, frame, bin).
 
     `time` (row,) [s] runs on through all logs; `stamp` (row,) [s] is the own clock of log number `log` (row,), `source`
-    (row,) the row there, `group` of which are averaged into one. `command` (row,) [m/s²]; `accel` [m/s²] and
+    (row,) the row there, `group` of which are averaged into one; `count` (row,) numbers rows of the log as its recorder
+    wrote them, lost ones too. `command` (row,) [m/s²]; `accel` [m/s²] and
     `speed` [m/s] (row,) or None; `smooth_speed` (row,) [m/s] and `position` (row,) [m], which effects read.
     `starts` (row,): first rows of stretches, between `bounds` (stretch + 1,). `frames`: first row and number of
     frames of each stretch that has any; `frame_time` (frame,) [s] their middles. `band_edges` (band + 1,) [bins];
     `band_of_bin` (bin,); `band_size` (band,) coefficients per channel.
-    `hold`: rows for which the recorder holds a speed, from row `hold_phase` on. `align_s` [s]: delay of the
+    `hold`: rows for which the recorder holds a speed, from the count `hold_phase` on. `align_s` [s]: delay of the
     accelerometer in the coefficients, by which both channels are in phase. `raw_accel`: as read, where outliers
     were replaced.
     `cache`: tables derived from the shape alone.
@@ -76,6 +77,7 @@ class DriveData:
     stamp: FloatArray
     log: IntArray
     source: IntArray
+    count: IntArray
     command: FloatArray
     accel: FloatArray | None
     speed: FloatArray | None
@@ -117,10 +119,14 @@ class DriveData:
         _same_kind(each)
         rate = min(log.rate_hz for log in each)
         group = max(1, int(1.02 * rate / _MOST_HZ))
-        columns: dict[str, list[FloatArray]] = {name: [] for name in ("time", "stamp", "log", "source", "u", "a", "v")}
+        columns: dict[str, list[FloatArray]] = {
+            name: [] for name in ("time", "stamp", "log", "source", "count", "u", "a", "v")
+        }
         lengths, begin, longest = [0], 0.0, 0.0
         for number, log in enumerate(each):
             assert log.accel_cmd is not None
+            steps = np.rint(np.diff(log.elapsed) * log.rate_hz)  # one by one: stamps need not be even
+            count = np.append(0, np.cumsum(np.maximum(steps, 1)).astype(np.int64))
             for part in _stretches(log):
                 rows = (part.stop - part.start) // group
                 cut = slice(part.start, part.start + rows * group)
@@ -136,6 +142,7 @@ class DriveData:
                 columns["stamp"].append(mean(log.time))
                 columns["log"].append(np.full(rows, number))
                 columns["source"].append(np.arange(cut.start, cut.stop, group))
+                columns["count"].append(count[cut.start : cut.stop : group] // group)
                 columns["u"].append(mean(log.accel_cmd))
                 columns["a"].append(mean(log.accel))
                 columns["v"].append(mean(log.speed))
@@ -157,6 +164,7 @@ class DriveData:
             stamp=whole["stamp"],
             log=whole["log"].astype(np.int64),
             source=whole["source"].astype(np.int64),
+            count=whole["count"].astype(np.int64),
             command=whole["u"],
             accel=accel,
             speed=speed,
@@ -308,13 +316,13 @@ class DriveData:
         return out
 
     def held(self, x: FloatArray) -> FloatArray:
-        """As a recorder shows it that refreshes every `hold` rows."""
+        """As a recorder shows it that refreshes every `hold` rows, whether or not that row was lost."""
         if self.hold == 1:
             return x
-        n = np.arange(len(x))
-        back = n - ((self.source // self.group) - self.hold_phase) % self.hold
-        first = self.bounds[np.searchsorted(self.bounds, n, side="right") - 1]
-        return x[np.maximum(back, first)]
+        n, count = np.arange(len(x)), self.count + self.log * (2 * self.count.max() + self.hold)
+        since = (self.count - self.hold_phase) % self.hold
+        first = np.repeat(self.bounds[:-1], np.diff(self.bounds))
+        return np.interp(np.maximum(np.interp(count - since, count, n), first), n, x)
 
     def low_pass(self, x: FloatArray, time_constant: float) -> FloatArray:
         """One pole of this time constant [s], at rest at the start of each stretch (see `one_pole`)."""
@@ -375,14 +383,13 @@ class DriveData:
         return out
 
     def _find_hold(self) -> tuple[int, int]:
-        """A speed that changes in every k-th row only: k and the row, counted from the log's first."""
+        """A speed that changes in every k-th row, but for repeated rows: k and the count of such a row."""
         if self.speed is None:
             return 1, 0
-        changed = np.diff(self.speed) != 0
-        rows = (self.source // self.group)[1:]
+        changed = (np.diff(self.speed) != 0) & (np.diff(self.count) == 1)
         for k in range(10, 1, -1):
-            counts = np.bincount(rows[changed] % k, minlength=k)
-            if counts.max() > 0.98 * counts.sum() and counts.sum() > 30:
+            counts = np.bincount(self.count[1:][changed] % k, minlength=k)
+            if counts.max() > 0.9 * counts.sum() and counts.sum() > 30:
                 return k, int(counts.argmax())
         return 1, 0
 

@@ -96,11 +96,9 @@ def families(h: Hypothesis) -> dict[str, FreeForm]:
     no map of its own)."""
     u = h["K_L"] * h.command()
     short, own, long, longest = _bank(h)
-    rate = own * np.diff(u, prepend=u[:1]) / h.data.dt  # a lead as long as the lag, in m/s^2
-    rate[h.data.starts] = 0.0
     up = np.maximum(u, 0.0)
     demands: dict[tuple[str, str], list[tuple[str, FloatArray, float]]] = {
-        ("linear", "dynamics"): [*(("u", u, lag) for lag in (short, long, longest)), ("slope of u", rate, own)],
+        ("linear", "dynamics"): [("u", u, lag) for lag in (short, long, longest)],
         ("sided", "dynamics"): [("u > 0", up, lag) for lag in (short, long, longest, own)],
     }
     forms = {name: _form(h, name, family, each) for (name, family), each in demands.items()}
@@ -147,8 +145,13 @@ def block(h: Hypothesis, form: FreeForm, iterations: int = 4) -> FreeFormFit:
         nats.append(value - count * math.log(sd) + log_prior - without)
         if nats[-1] == max(nats):
             best, size = moves, sd
-    taken = np.tensordot(best[:known], h.jacobian, 1) + np.tensordot(best[known:], form.columns, 1)
-    return FreeFormFit(log_sum(nats), h.residual - taken, best[known:], size)
+    taken = np.tensordot(best[known:], form.columns, 1)
+    over, residual = 0.0, h.residual - taken - np.tensordot(best[:known], h.jacobian, 1)
+    if form.family == "dynamics":  # far from its place the response is no straight line in the parameters
+        there = _moved(h, best[: len(h.free)])
+        over = log_likelihood(h.data, residual)[0] - log_likelihood(h.data, there.residual - taken)[0]
+        residual = there.residual - taken
+    return FreeFormFit(log_sum(nats) - max(over, 0.0), residual, best[known:], size)
 
 
 def wandering(h: Hypothesis) -> dict[str, FreeFormFit]:
@@ -282,6 +285,15 @@ def linear_evidence(
         if gain > best or integrated:  # the noise has to settle first
             best, at = gain, moves
     return best, at
+
+
+def _moved(h: Hypothesis, moves: FloatArray) -> Hypothesis:
+    """The hypothesis with its free parameters moved as far as their limits let them, evaluated."""
+    there = h.copy()
+    for name, move in zip(h.free, moves.tolist(), strict=True):
+        low, high = h.limits(name)
+        there[name] = min(max(h[name] + move, low), high)
+    return there.evaluate()
 
 
 def _bank(h: Hypothesis) -> tuple[float, ...]:

@@ -27,7 +27,7 @@ class TorchRecorder:
     data: DriveData
     grid_time: Tensor
     time: Tensor
-    kept: Tensor
+    held: tuple[Tensor, Tensor]
     aligned: tuple[Tensor, Tensor]
     span: Tensor
     inner: Tensor
@@ -35,6 +35,7 @@ class TorchRecorder:
     @classmethod
     def of(cls, data: DriveData) -> TorchRecorder:
         time, n = torch.as_tensor(data.time), len(data.time)
+        row = torch.as_tensor(data.held(np.arange(float(n))))
         inner = np.arange(n)
         inner[data.bounds[1:] - 1] -= 1
         inner[data.bounds[:-1]] += 1
@@ -42,7 +43,7 @@ class TorchRecorder:
             data,
             torch.as_tensor(data.grid.time),
             time,
-            torch.as_tensor(data.held(np.arange(float(n)))).long(),
+            (row.long().clamp(max=n - 2), row - row.long().clamp(max=n - 2)),
             _between(time, time - data.align_s),
             (time[2:] - time[:-2]).clamp_min(0.3 * data.dt),
             torch.as_tensor(inner) - 1,
@@ -60,7 +61,7 @@ class TorchRecorder:
             shown.append(_read(a, index, share) if self.data.align_s else a)
         if self.data.speed is not None:
             v = self._low_pass(self._late(gained, values["speed_delay"]), values["speed_filter"])
-            v = v if self.data.hold == 1 else v[..., self.kept]
+            v = v if self.data.hold == 1 else _read(v, *self.held)
             difference = (v[..., 2:] - v[..., :-2]) / self.span
             shown.append(difference[..., self.inner])
         return cast(Tensor, _Transform.apply(torch.stack(shown, -2), self.data))

@@ -26,7 +26,12 @@ LATE = [e for e in VALUES if EFFECTS[e].onset == "may"]
 
 
 def a_log(
-    *, jitter: float = 0.0, pause: bool = False, held: int = 1, channels: tuple[str, ...] = ("accel", "speed")
+    *,
+    jitter: float = 0.0,
+    pause: bool = False,
+    held: int = 1,
+    lost: float = 0.0,
+    channels: tuple[str, ...] = ("accel", "speed"),
 ) -> Log:
     """Thirty seconds that reach every effect, with noise."""
     random = np.random.default_rng(1)
@@ -39,7 +44,9 @@ def a_log(
         speed[1200:1300] = 0.0
     speed = speed[n // held * held] + 0.01 * random.standard_normal(len(n)) * (held == 1)
     signals = {"accel": accel, "speed": speed}
-    return Log.from_arrays(time=time, accel_cmd=command, **{name: signals[name] for name in channels})
+    kept = random.random(len(n)) >= lost
+    kept[0] = True
+    return Log.from_arrays(time=time[kept], accel_cmd=command[kept], **{name: signals[name][kept] for name in channels})
 
 
 def a_hypothesis(effects: tuple[str, ...] = (), data: DriveData | None = None, onset: str = "") -> Hypothesis:
@@ -88,10 +95,11 @@ def test_unnamed_dynamics_and_lost_messages():
         a_log(jitter=1.0),
         a_log(pause=True),
         a_log(held=5),
+        a_log(held=5, lost=0.03),
         a_log(channels=("accel",)),
         a_log(channels=("speed",)),
     ],
-    ids=["jitter", "two stretches", "held speed", "accel", "speed"],
+    ids=["jitter", "two stretches", "held speed", "held speed, lost rows", "accel", "speed"],
 )
 def test_drives_of_all_kinds(log):
     data = DriveData.of(log)

@@ -15,10 +15,12 @@ from avtorch import Log
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.free_forms import (
+    COEFFICIENT_SD,
     TONE_HZ,
     FreeForm,
     _between_bins,
     _first_order_backwards,
+    _moved,
     band_products,
     block,
     demand_response,
@@ -30,7 +32,7 @@ from avtorch.gap.engine.free_forms import (
 )
 from avtorch.gap.engine.gauss_newton import fit, jacobian, prior_terms, whitened_jacobian
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import whiten
+from avtorch.gap.engine.likelihood import log_likelihood, whiten
 
 DT, SECONDS, LAG, GAIN = 0.02, 150.0, 0.4, 0.9
 ACCEL_SD, SPEED_SD = 0.1, 0.03
@@ -190,6 +192,21 @@ def test_residual_is_what_the_coefficients_leave() -> None:
     basis = h.jacobian.reshape(len(h.jacobian), -1)
     left = flat - basis.T @ np.linalg.lstsq(basis.T, flat, rcond=None)[0]
     assert np.linalg.norm(left) < 1e-6 * np.linalg.norm(flat)
+
+
+def test_what_dynamics_leave_is_left_by_a_car_within_its_limits() -> None:
+    """Far from a fit the response is no straight line in its parameters: the moved car's own response counts."""
+    h = _car(_lags)
+    moves = np.array([-3.0 if name == "T_L" else 0.01 for name in h.free])
+    there = _moved(h, moves)
+    assert there["T_L"] == h.limits("T_L")[0]
+    np.testing.assert_allclose([there[n] - h[n] for n in h.free if n != "T_L"], 0.01)
+    np.testing.assert_allclose(there.residual, h.data.measured - there.response())
+    form = families(h)["linear"]
+    found = block(h, form)
+    assert found.residual is not None
+    left = log_likelihood(h.data, found.residual)[0] - h.log_likelihood
+    assert found.nats <= left - 0.5 * float(found.coefficients @ found.coefficients) / COEFFICIENT_SD**2 + 1e-6
 
 
 @pytest.mark.parametrize("channels", [("accel", "speed"), ("speed",), ("accel",)], ids="+".join)
