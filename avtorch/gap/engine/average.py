@@ -290,9 +290,7 @@ def _composed(
         if shape is not None:
             given = np.ascontiguousarray(shape.covariances[k]), shape.counts[k]
         found = slow_forces(data, residual, _from_the_start(h), given=given, lags=lags)
-        covariance, counts = given
-        n = found.bands
-        free = -0.5 * float((counts[:n] * (np.linalg.slogdet(covariance[:n])[1] + data.channel_count)).sum())
+        free = -0.5 * float((found.counts * (np.linalg.slogdet(found.covariance)[1] + data.channel_count)).sum())
         total = exact + nats + float(value) + found.log_likelihood - free
         for name, more in zip(SLOW, (0.0, found.gust, found.road), strict=True):
             parts[name].append(total + more)

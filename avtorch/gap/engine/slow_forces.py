@@ -397,20 +397,17 @@ def gust_onset(data: DriveData, residual: FloatArray, found: SlowForces) -> tupl
 def _before_the_sensor(data: DriveData, values: FloatArray, bands: int) -> FloatArray:
     """Factors (band, channel, channel) of a covariance: what pushes the car passes the accelerometer's lag and scale.
 
-    Of a common power P the accelerometer shows P |H|², and P Re H together with the speed; for one pole both are
-    P / (1 + w² tau²).
+    Of a common power P the accelerometer shows P |H|², and P Re H together with the speed; for one pole of scale k,
+    P k² / L and P k / L with L = 1 + (w tau)². Scaled by L / k it shows P in common with the speed, and what is out of
+    phase beside its own noise. A reading is scaled, so that a covariance stays one.
     """
     out = np.ones((bands, data.channel_count, data.channel_count))
     if data.channel_count == 2:
-        w = (
-            2
-            * np.pi
-            * 0.5
-            * (data.frequency[data.band_edges[:bands]] + data.frequency[data.band_edges[1 : bands + 1] - 1])
-        )
-        lagged, scale = 1 + (w * values[INDEX["sensor_lag"]]) ** 2, 1 + values[INDEX["sensor_scale"]]
-        out[:, 0, 0] = lagged / scale**2
-        out[:, 0, 1] = out[:, 1, 0] = lagged / scale
+        first, last = data.band_edges[:bands], data.band_edges[1 : bands + 1] - 1
+        w = np.pi * (data.frequency[first] + data.frequency[last])
+        scale = (1 + (w * values[INDEX["sensor_lag"]]) ** 2) / (1 + values[INDEX["sensor_scale"]])
+        out[:, 0, 0] = scale**2
+        out[:, 0, 1] = out[:, 1, 0] = scale
     return out
 
 
