@@ -6,7 +6,7 @@ import unicodedata
 from collections.abc import Iterable
 
 _LONGEST = 1000  # characters of a message
-_NAME, _NAMES = 24, 12  # characters of a name in a list, and names
+_NAME, _NAMES = 120, 12  # characters of a name in a list, and names
 
 
 class InputError(ValueError):
@@ -52,7 +52,8 @@ def quoted(text: str, most: int = 40) -> str:
 
 
 def listed(names: Iterable[str]) -> str:
-    """The first dozen of `names`, escaped and shortened, and the number of the rest."""
+    """The first dozen of `names`, escaped and whole up to 120 characters, so that they can be copied, and the number of
+    the rest."""
     all_ = list(names)
     listing = ", ".join(printable(name, _NAME) for name in all_[:_NAMES])
     rest = len(all_) - _NAMES

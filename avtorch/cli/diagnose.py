@@ -359,10 +359,9 @@ def _prior(given: Sequence[str]) -> dict[str, float]:
 
 
 def _usable(path: Path, drive: Log, accel_kind: str) -> None:
-    if not drive.usable.any():
-        raise InputError(
-            f"{path}: has no row to use; all are driven by hand (engaged 0), within 2 s after, or at standstill"
-        )
+    from avtorch.io.quality import require_usable
+
+    require_usable(drive)
     if accel_kind == "specific-force" and drive.accel is None:
         raise InputError(f"--accel-kind: found specific-force, but {path} has no accel")
 
