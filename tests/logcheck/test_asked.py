@@ -139,3 +139,27 @@ def test_names_in_errors_are_whole(tmp_path: Path) -> None:
     path = written(tmp_path / "bag.csv", lists({"time": d["time"], name: d["speed"], "accel_cmd": d["accel_cmd"]}))
     with pytest.raises(InputError, match=name):
         Log.read(path)
+
+
+def robot(folder: Path, *, columns: bool) -> list[str]:
+    """A robot that follows a commanded speed, and its simulator's output in a file or in columns: arguments."""
+    time = np.arange(0.0, 60.0, 0.05)
+    asked = 0.25 * (1 + np.sign(np.sin(0.5 * time))) / 2
+    speed = np.convolve(asked, np.full(10, 0.1), mode="full")[: len(time)]
+    car = {"time": time, "speed_cmd": asked, "speed": speed}
+    if columns:
+        return [str(written(folder / "both.csv", lists(car | {"sim.speed": asked}))), "--simulated", "sim."]
+    simulated = written(folder / "sim.csv", lists({"time": time, "speed_cmd": asked, "speed": asked}))
+    return [str(written(folder / "car.csv", lists(car))), "--simulated", str(simulated)]
+
+
+@pytest.mark.parametrize("columns", [False, True])
+def test_a_simulator_with_a_loop_of_its_own_is_refused_in_one_line(
+    columns: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before: "column 'spacing' is missing", or "lacks nothing" beside errors of 0.9 m/s."""
+    assert main(["diagnose", *robot(tmp_path, columns=columns), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert "--simulated" in said
+    assert "commands a speed, which car and simulator follow by loops of their own" in said
+    assert len(said.splitlines()) == 1
