@@ -35,6 +35,8 @@ _OTHERWISE = -3.0
 """Nats of a name that says something else, such as `lead_speed`, `LatAcc` or `throttle`."""
 _TAKEN = 0.6
 """Nats from which a column is taken: a correlation of 0.8 where no name tells, or a name that no data contradict."""
+_TOLD = -1.0
+"""Nats of data from which a column is worth a question: a correlation of 0.63 of one motion."""
 _STEEP = {"motion": 7, "response": 3}
 """Power of the correlation with which its density rises between right columns; a car's answer is looser than one motion
 read twice. Between others it is even."""
@@ -74,7 +76,7 @@ def assign(clock: FloatArray, parts: list[slice], columns: list[Column], given: 
         rest = [c for c in unnamed if signal != "accel" or _unit_of_accel(c) is not None]
         options[signal] = [*named, *rest]
     motion = _Motion(clock, parts, options)
-    options = {signal: _promising(signal, options, motion) for signal in MOTION}
+    options = {s: options[s] if s in given else _promising(s, options, motion) for s in MOTION}
     choices = sorted(_choices(options, motion, given), key=lambda choice: -choice[0])
     found, reasons, doubts = {}, {}, []
     best = choices[0][1]
@@ -240,8 +242,8 @@ def _promising(signal: str, options: Mapping[str, list[Column]], motion: _Motion
                 if signal not in column.likeness and other.name != column.name:
                     of = {**dict.fromkeys(MOTION), signal: column, name: other}
                     gain = sum(_evidence(kind, r) for kind, _, r in motion.pairs(of))
-                    promise[column.name] = max(promise.get(column.name, 0.0), gain)
-    rest = [column for column in options[signal] if promise.get(column.name, 0.0) > _TAKEN]
+                    promise[column.name] = max(promise.get(column.name, -math.inf), gain)
+    rest = [column for column in options[signal] if promise.get(column.name, -math.inf) > _TOLD]
     if signal == "accel_cmd":
         rest = [column for column in rest if _comes_first(column, others, motion)]
     return [*named, *sorted(rest, key=lambda column: -promise[column.name])[:_KEPT]]
