@@ -67,9 +67,8 @@ def frame_table(frame: DataFrame, source: str = "DataFrame") -> Table:
     ]
     kept = [i for i, column in enumerate(cells) if column is not None]
     form = f"a {type(frame).__name__}"
-    return with_whole_stamps(
-        Table(source, tuple(str(names[i]) for i in kept), tuple(cells[i] for i in kept), form=form)
-    )
+    both = with_whole_stamps(tuple(str(names[i]) for i in kept), tuple(cells[i] for i in kept))
+    return Table(source, *both, form=form)
 
 
 def _interchanged(frame: DataFrame) -> Any:

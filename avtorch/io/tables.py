@@ -178,7 +178,9 @@ def _number(cell: Any) -> float:
 def _no_number(cell: Any, need: str) -> str:
     if not isinstance(cell, str):
         return f"a {type(cell).__name__} is no number; {need}"
-    return f"{quoted(cell, 30)} is {'no number' if need != _TIME else 'of no known form'}; {need}"
+    if need == _TIME and not is_time(cell):
+        return f"{quoted(cell, 30)} is no number, and no time of a known form; {need}"
+    return f"{quoted(cell, 30)} is no number; a number is needed"
 
 
 def read_table(path: str | os.PathLike[str], *, header: str | None = None, wanted: Wanted | None = None) -> Table:
@@ -198,11 +200,11 @@ def read_table(path: str | os.PathLike[str], *, header: str | None = None, wante
         from avtorch.io.parquet import read_parquet
 
         names, cells = read_parquet(raw, place(file), wanted)
-        return with_whole_stamps(Table(place(file), names, cells, form="Parquet"))
+        return Table(place(file), *with_whole_stamps(names, cells), form="Parquet")
     if file.suffix.lower() in (".parquet", ".pq"):
         raise InputError(f"{place(file)}: named as Parquet but its content is not; write it anew, or name it .csv")
     text, remarks = decoded(place(file), raw)
-    return with_whole_stamps(replace(text_table(place(file), text, header, wanted), remarks=remarks))
+    return replace(text_table(place(file), text, header, wanted), remarks=remarks)
 
 
 def read_bytes(file: Path) -> bytes:
@@ -239,7 +241,8 @@ def text_table(source: str, text: str, header: str | None, wanted: Wanted | None
     read = dict(zip(kept, columns, strict=True))
     cells = tuple(read.get(i) for i in range(len(names)))
     form = f"text, {layout.words}"
-    return Table(source, names, cells, lines, decimal=layout.decimal, units=units, faults=faults, form=form)
+    both = with_whole_stamps(names, cells)
+    return Table(source, *both, lines, decimal=layout.decimal, units=units, faults=faults, form=form)
 
 
 def _line_of(text: str, layout: Layout, first_cell: str) -> int:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Collection, Sequence
+from typing import Any
 
-if TYPE_CHECKING:
-    from avtorch.io.tables import Table
+from numpy.typing import NDArray
 
 _NANOSECONDS = re.compile(r"(?P<stem>.*?)(?:nanosecs?|nsecs?|ns)")
 _SECONDS = ("sec", "secs", "s")
@@ -36,15 +34,22 @@ def with_halves(wanted: Callable[[tuple[str, ...]], Collection[str]]) -> Callabl
     return chosen
 
 
-def with_whole_stamps(table: Table) -> Table:
-    """The table with a column for each stamp in two whose columns were read, the digits side by side."""
-    names, cells = list(table.names), list(table.cells)
-    for name, halves in whole_stamps(table.names).items():
-        seconds, nanoseconds = (table.cells[table.names.index(half)] for half in halves)
-        if seconds is not None and nanoseconds is not None:
-            names.append(name)
-            cells.append([_stamp(str(a).strip(), str(b).strip()) for a, b in zip(seconds, nanoseconds, strict=True)])
-    return replace(table, names=tuple(names), cells=tuple(cells))
+def with_whole_stamps(
+    names: Sequence[str], cells: Sequence[Sequence[Any] | NDArray | None]
+) -> tuple[tuple[str, ...], tuple[Sequence[Any] | NDArray | None, ...]]:
+    """The `names` and `cells` of a table's columns, with a column of text for each stamp in two: the digits side by
+    side, None where its columns were not read."""
+    whole = list(cells)
+    found = whole_stamps(names)
+    for halves in found.values():
+        seconds, nanoseconds = (cells[names.index(half)] for half in halves)
+        known = seconds is not None and nanoseconds is not None
+        whole.append(
+            [_stamp(str(a).strip(), str(b).strip()) for a, b in zip(seconds, nanoseconds, strict=True)]
+            if known
+            else None
+        )
+    return (*names, *found), tuple(whole)
 
 
 def _stamp(seconds: str, nanoseconds: str) -> str:

@@ -112,7 +112,7 @@ def test_stamps_of_no_known_form_are_said_to_be_that(tmp_path: Path, capsys: pyt
         assert main([*command[:1], str(path), *command[1:]]) == 2
         said = capsys.readouterr().err
         assert "row 1 (line 2), column 'stamp'" in said
-        assert "'2024_04_23_12_31_00_0' is of no known form" in said
+        assert "'2024_04_23_12_31_00_0' is no number, and no time of a known form" in said
 
 
 @pytest.mark.parametrize(("seconds", "nanoseconds"), [("sec", "nanosec"), ("secs", "nsecs"), ("s", "ns")])
