@@ -43,12 +43,10 @@ def with_whole_stamps(
     found = whole_stamps(names)
     for halves in found.values():
         seconds, nanoseconds = (cells[names.index(half)] for half in halves)
-        known = seconds is not None and nanoseconds is not None
-        whole.append(
-            [_stamp(str(a).strip(), str(b).strip()) for a, b in zip(seconds, nanoseconds, strict=True)]
-            if known
-            else None
-        )
+        if seconds is None or nanoseconds is None:
+            whole.append(None)
+        else:
+            whole.append([_stamp(str(a).strip(), str(b).strip()) for a, b in zip(seconds, nanoseconds, strict=True)])
     return (*names, *found), tuple(whole)
 
 

@@ -24,7 +24,7 @@ from avtorch.logcheck.header import bare_unit
 from avtorch.logcheck.order_of_events import lateness
 from avtorch.logcheck.vocabulary import means_otherwise
 
-MOTION = ("accel_cmd", "accel", "speed")
+MOTION: tuple[str, ...] = ("accel_cmd", "accel", "speed")
 PLAIN = 3.0
 """Nats by which a choice must lead another one for that to be ruled out."""
 
@@ -270,7 +270,7 @@ def _choices(
     for combination in product(*([*options[s], *(none if s not in given else [])] or none for s in MOTION)):
         names = [column.name for column in combination if column is not None]
         if len(set(names)) == len(names):
-            of = dict(zip(MOTION, combination, strict=True))
+            of: dict[str, Column | None] = dict(zip(MOTION, combination, strict=True))
             yield _score(of, motion), of
 
 

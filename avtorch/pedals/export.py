@@ -126,10 +126,10 @@ def _strict(accel: FloatArray, side: float) -> tuple[FloatArray, int]:
 
     Readers of such tables look up the pedal of an acceleration, and refuse one that two pedals give.
     """
-    rise = np.round(side * accel / _LAST_DIGIT)
+    rise: FloatArray = np.round(side * accel / _LAST_DIGIT).astype(np.float64)
     steps = np.arange(len(rise))[:, None]
     # the least table above it whose rows are a digit apart
-    strict = np.maximum.accumulate(rise - steps, axis=0) + steps
+    strict = np.asarray(np.maximum.accumulate(rise - steps, axis=0) + steps, dtype=np.float64)
     flat = int((np.diff(rise, axis=0) < 1).sum())
     return (side * strict * _LAST_DIGIT if flat else accel), flat
 
