@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import unicodedata
 from collections.abc import Iterable
+from itertools import accumulate, takewhile
 
 _LONGEST = 1000  # characters of a message
-_NAME, _NAMES = 24, 12  # characters of a name in a list, and names
+_NAME, _NAMES, _LIST = 120, 12, 360  # characters of a name in a list, names, and characters of the list
 
 
 class InputError(ValueError):
@@ -52,10 +53,12 @@ def quoted(text: str, most: int = 40) -> str:
 
 
 def listed(names: Iterable[str]) -> str:
-    """The first dozen of `names`, escaped and shortened, and the number of the rest."""
-    all_ = list(names)
-    listing = ", ".join(printable(name, _NAME) for name in all_[:_NAMES])
-    rest = len(all_) - _NAMES
+    """The first of `names`, escaped, and the number of the rest: a dozen at most, and of long ones fewer, as each is
+    whole up to 120 characters so that it can be copied."""
+    all_ = [printable(name, _NAME) for name in names]
+    shown = list(takewhile(lambda so_far: len(so_far) <= _LIST, accumulate(all_[:_NAMES], "{}, {}".format)))
+    listing = shown[-1] if shown else ""
+    rest = len(all_) - len(shown)
     return f"{listing} and {rest} more" if rest > 0 else listing
 
 

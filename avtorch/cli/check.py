@@ -16,6 +16,13 @@ from avtorch.errors import InputError
 def check(
     log: Path,
     *,
+    map: Annotated[
+        list[str] | None,
+        Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
+    ] = None,
+    unit: Annotated[
+        list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable.")
+    ] = None,
     yes: Annotated[
         bool, Parameter(name=("--yes", "-y"), negative=(), group=OUTPUT, help="Write the proposed mapping unasked.")
     ] = False,
@@ -25,7 +32,8 @@ def check(
     """Check a log: what it holds, how to read it, what it can tell and what not.
 
     Names and units of its columns are found from their headers and from the data, each with its reason, and proposed as
-    a mapping: LOG.toml beside the log, which every other command then reads.
+    a mapping: LOG.toml beside the log, which every other command then reads. What is in doubt is asked: answer with
+    --map and --unit, which become part of it.
 
     Parameters
     ----------
@@ -37,7 +45,7 @@ def check(
     from avtorch.logcheck.check import check as work
 
     talk = Talk(json=json, quiet=quiet)
-    found = work(log)
+    found = work(log, map=map, unit=unit)
     proposal, beside = found.proposal, mapping_place(log)
     talk.check(found)
     if json and not quiet:

@@ -78,7 +78,8 @@ def compare(
 ) -> None:
     """Did a change to the car, or to the simulator, help? By how much, with intervals.
 
-    Two simulators and one log: which is nearer to the car, and by what.
+    Two simulators and one log: which is nearer to the car, and by what. Several drives a side: `avtorch.compare` in
+    Python takes lists.
 
     Parameters
     ----------
@@ -160,12 +161,10 @@ def _files(sources: Sequence[str]) -> list[Path]:
 
 def _log(path: Path, map: list[str] | None, unit: list[str] | None, talk: Talk) -> Log:
     from avtorch.io import Log, check
+    from avtorch.io.quality import require_usable
 
     log = Log.read(path, map=map, unit=unit)
-    if not log.usable.any():
-        raise InputError(
-            f"{path}: has no row to use; all are driven by hand (engaged 0), within 2 s after, or at standstill"
-        )
+    require_usable(log)
     talk.notes(log.name, check(log).notes)
     return log
 

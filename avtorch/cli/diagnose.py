@@ -21,7 +21,7 @@ from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.simulator import read_simulator
 from avtorch.cli.talk import Talk
-from avtorch.cli.tested_simulator import simulator_of
+from avtorch.cli.tested_simulator import refuse_loop, simulator_of
 from avtorch.errors import InputError, quoted
 from avtorch.numeral import numeral
 
@@ -200,7 +200,9 @@ def diagnose(
     for option, given in (("--vehicle", vehicle), ("--law", law), ("--event", event)):
         if given is not None:
             raise InputError(f"{option}: has a meaning with --follower only")
-    drives, fit, about_map = commanded(talk, [Log.read(path, map=map, unit=unit, stamp=stamp) for path in logs])
+    read = [Log.read(path, map=map, unit=unit, stamp=stamp) for path in logs]
+    refuse_loop(simulated, read)
+    drives, fit, about_map = commanded(talk, read)
     for path, drive in zip(logs, drives, strict=True):
         _usable(path, drive, accel_kind)
         _check_effects(chosen or (), path, drive)
@@ -292,13 +294,14 @@ def diagnose(
     talk.out.print()
     for note in diagnosis_notes(found):
         talk.out.print(note)
-    names = [p.name + _FILES.get(p.suffix, "") for p in written]
+    names = [p.name + _FILES.get(p.name, _FILES.get(p.suffix, "")) for p in written]
     talk.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {', '.join(names)}", soft_wrap=True)
 
 
 _FILES = {
     ".toml": " (the repaired simulator)",
-    ".csv": " (what to drive next)",
+    "manoeuvre.csv": " (what to drive next)",
+    ".csv": " (the map of the commands)",
     ".yaml": " (in that tool's terms)",
     ".xml": " (in that tool's terms)",
     ".html": " (to read)",
@@ -359,10 +362,9 @@ def _prior(given: Sequence[str]) -> dict[str, float]:
 
 
 def _usable(path: Path, drive: Log, accel_kind: str) -> None:
-    if not drive.usable.any():
-        raise InputError(
-            f"{path}: has no row to use; all are driven by hand (engaged 0), within 2 s after, or at standstill"
-        )
+    from avtorch.io.quality import require_usable
+
+    require_usable(drive)
     if accel_kind == "specific-force" and drive.accel is None:
         raise InputError(f"--accel-kind: found specific-force, but {path} has no accel")
 

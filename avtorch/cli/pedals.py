@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from avtorch.cli.talk import Talk
 
 if TYPE_CHECKING:
+    from avtorch.arrays import FloatArray
     from avtorch.io import Log
     from avtorch.pedals import HeldOut, PedalFit, PedalTable
 
-_UNITS = {"torque": "Nm", "current": "A", "speed_error": "m/s", "speed_cmd_rate": "m/s²"}
 PICTURE = "pedal_map.png"
 FILES = ("pedal_map.csv", "accel_map.csv", "brake_map.csv", PICTURE)
 """Every file of a map, named here because `avtorch.pedals` brings SciPy, which a log without pedals does not need."""
@@ -64,16 +64,13 @@ def _steepest(table: PedalTable) -> float:
     return float(slopes[beside].max())
 
 
-def _range(name: str, knots: object) -> str:
-    import numpy as np
+def _range(name: str, knots: FloatArray) -> str:
+    from avtorch.pedals.pedal_map import unit_of
 
-    values = np.asarray(knots)
-    low, high = float(values[0]), float(values[-1])
-    if name == "throttle" or (name == "brake" and high <= 1.2):
-        return f"{100 * low:.3g} to {100 * high:.3g} %"
-    if name == "brake":
-        return f"{low / 1e5:.3g} to {high / 1e5:.3g} bar"
-    return f"{low:.3g} to {high:.3g} {_UNITS[name]}"
+    low, high = float(knots[0]), float(knots[-1])
+    unit = unit_of(name, high)
+    size, shown = {"-": (100.0, "%"), "Pa": (1e-5, "bar")}.get(unit, (1.0, unit.replace("2", "²")))
+    return f"{size * low:.3g} to {size * high:.3g} {shown}"
 
 
 def write_pedals(fit: PedalFit | None, staged: Path) -> list[Path]:

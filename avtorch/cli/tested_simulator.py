@@ -69,8 +69,19 @@ def simulator_of(
         raise InputError(f"--simulated: found {len(simulated)} files for {len(drives)} logs, needs one for each log")
     from avtorch.io import Log
 
-    outputs = [Log.read(path, following=True) for path in simulated]
+    outputs = [Log.read(path) for path in simulated]
     return ExternalSimulator(outputs, name=", ".join(Path(path).name for path in simulated))
+
+
+def refuse_loop(simulated: Sequence[str] | None, drives: Sequence[Log]) -> None:
+    """Raises `InputError` where the output of a simulator stands beside drives by a commanded speed: it follows that by
+    a loop of its own, and the acceleration that a map makes of the car's loop is not its command."""
+    for drive in drives if simulated else ():
+        if drive.accel_cmd is None and not drive.pedals and drive.speed_cmd is not None:
+            raise InputError(
+                f"--simulated: {drive.name} commands a speed, which car and simulator follow by loops of their own; "
+                "needs accel_cmd or a pedal, or leave --simulated out to diagnose the car alone"
+            )
 
 
 def simulators_of(

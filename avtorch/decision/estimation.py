@@ -32,7 +32,7 @@ from avtorch.inference.stream import BeliefStream
 from avtorch.io.log import Log
 from avtorch.io.mapping import Pairs
 from avtorch.io.no_command import no_command
-from avtorch.io.quality import Quality, check
+from avtorch.io.quality import Quality, check, require_usable
 from avtorch.io.source import LogSource, as_log
 from avtorch.logcheck.late_channel import LateChannel, late_channel, on_time
 
@@ -200,10 +200,7 @@ def estimate(
     log = as_log(log, map=map, unit=unit)
     if log.accel_cmd is None:
         raise no_command(log, "; T_L and K_L need the demanded acceleration")
-    if not log.usable.any():
-        raise InputError(
-            f"{log.name}: has no row to use; all are driven by hand (engaged 0), within 2 s after, or at standstill"
-        )
+    require_usable(log)
     chosen = _form(log, form)
     if not window > 0:
         raise InputError(f"window: found {window:g} s, needs a number above 0")

@@ -19,6 +19,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from avtorch.display.bars import Bar, NoBar, bar_here
 from avtorch.display.notebook import notebook_display
+from avtorch.threads import one_thread
 
 AFTER_S = 1.0
 """A work that takes less shows no bar [s]."""
@@ -80,14 +81,16 @@ def asks_for_bar(progress: object) -> bool:
 
 
 def shows_progress(function: Callable[P, R]) -> Callable[P, R]:
-    """Gives `function` the bar that its keyword `progress` asks for (see `asks_for_bar`)."""
+    """Gives `function`, a long call, the bar that its keyword `progress` asks for (see `asks_for_bar`), and one thread
+    (see `avtorch.threads`)."""
 
     @wraps(function)
     def inner(*args: P.args, **kwargs: P.kwargs) -> R:
-        if asks_for_bar(kwargs.get("progress")):
-            with progress_bar(function.__name__.replace("_", " ")) as step:
-                return function(*args, **{**kwargs, "progress": step})  # type: ignore[arg-type]
-        return function(*args, **kwargs)
+        with one_thread():
+            if asks_for_bar(kwargs.get("progress")):
+                with progress_bar(function.__name__.replace("_", " ")) as step:
+                    return function(*args, **{**kwargs, "progress": step})  # type: ignore[arg-type]
+            return function(*args, **kwargs)
 
     return inner
 

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from avtorch.io import STANDSTILL_MPS, Log
+from avtorch.io import Log
 
 
 def drives_of(log: Log) -> list[slice]:
@@ -21,7 +21,7 @@ def drives_of(log: Log) -> list[slice]:
     for part in log.engaged_segments():
         starts = [part.start]
         if log.speed is not None:
-            stands = log.speed[part] < STANDSTILL_MPS
+            stands = log.speed[part] < log.standstill_mps
             starts += [part.start + int(k) for k in np.flatnonzero(np.diff(stands.astype(int)) == -1)]
         edges = [*dict.fromkeys(starts), part.stop]
         out += [slice(a, b) for a, b in pairwise(edges) if b - a > 1]

@@ -132,7 +132,9 @@ class _Drive:
         except (TypeError, ValueError):
             raise self._fault(stamp, f"step returned {quoted(repr(answer))}, needs (accel, speed)") from None
         if not (math.isfinite(pair[0]) and math.isfinite(pair[1])):
-            raise self._fault(stamp, f"step returned {pair}, needs finite numbers")
+            raise self._fault(
+                stamp, f"step returned {pair}, needs finite numbers; smaller steps may give them (--step {own / 5:g})"
+            )
         return pair
 
     def _called(self, stamp: float, call: Callable[[], object], what: str) -> object:

@@ -183,7 +183,10 @@ class RunningFmu:
                 self._step(h)
             shown[:, k] = self._shown()
             if not np.isfinite(shown[:, k]).all():
-                raise _Stopped(f"it answers {', '.join(f'{x:g}' for x in shown[:, k])}; finite numbers are needed")
+                raise _Stopped(
+                    f"it answers {', '.join(f'{x:g}' for x in shown[:, k])} after steps of {h:g} s; finite numbers are "
+                    f"needed, which smaller steps may give (--step {h / 5:g}, in Python step_s)"
+                )
         return shown
 
     def _step(self, h: float) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from avtorch.errors import InputError, listed, printable, quoted
+from avtorch.io.mapping import PEDALS
 from avtorch.io.unit_names import unit_named
 from avtorch.io.units import to_si
 from avtorch.logcheck.header import header_of
@@ -121,6 +122,11 @@ def _recognised(source: str, signal: str, able: list[Variable]) -> tuple[Variabl
     needs = f'map={{{signal!r}: ...}} or a line {signal} = "..." below [fmu] in its TOML file'
     if not able:
         raise InputError(f"{source}: has no real {kind} for {signal}; an FMU with one is needed")
+    if signal == "accel_cmd" and (pedals := [v for v in able if any(likeness(header_of(v.name), p) for p in PEDALS)]):
+        raise InputError(
+            f"{source}: takes {_names(pedals)}, and no acceleration; an FMU is driven by accel_cmd: put what makes "
+            "pedals of it into the FMU, or give --simulated its output"
+        )
     raise InputError(f"{source}: {signal} may be several of its {kind}s, or none: {_names(able)}; needs {needs}")
 
 

@@ -24,7 +24,8 @@ from avtorch.io.units import to_si
 from avtorch.io.validity import check_range, check_rate, check_time, off_clock, stray
 
 _NAME = 40  # characters of the longest column name that may be a signal's, mistyped
-_DEAD_MPS = 1.0  # change of speed that an accelerometer in order notices
+# change of speed that an accelerometer in order notices: 1 m/s, and a tenth of the speed of what is slower
+_DEAD_MPS, _DEAD_SHARE = 1.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,9 @@ def _leave_out_dead(signals: dict[str, FloatArray], mapping: SignalMap, remarks:
         return
     time, speed = signals["time"] - signals["time"].mean(), signals["speed"]
     change = float(np.ptp(speed))
-    if np.ptp(speed - time * (time @ speed) / max(float(time @ time), 1e-12)) > _DEAD_MPS:
+    if np.ptp(speed - time * (time @ speed) / max(float(time @ time), 1e-12)) > min(
+        _DEAD_MPS, _DEAD_SHARE * float(np.abs(speed).max())
+    ):
         value = float(signals.pop("accel")[0])
         remarks.append(
             f"column {mapping.column.get('accel', 'accel')!r} is {value:g} in every row while speed changes by "

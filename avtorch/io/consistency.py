@@ -3,6 +3,7 @@ rate."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -19,11 +20,73 @@ _MAY_BE = 0.5
 
 class Scale(NamedTuple):
     """``slope`` [-]: change of the first signal per integral of the second; ``correlation`` of the two; ``change``:
-    standard deviation of the first one's changes, in its unit per second."""
+    standard deviation of the first one's changes, in its unit per second; ``spans``: how many separate ones."""
 
     slope: float
     correlation: float
     change: float
+    spans: float
+
+    @property
+    def factor(self) -> float | None:
+        """The factor by which the first signal surely changes more, or less, than the second implies; None where that
+        may be 1.
+
+        Noise in the second signal lowers the slope, noise in the first the slope of the inverse relation: the true
+        factor lies between the two (Frisch 1934), give or take three standard errors.
+        """
+        r = self.correlation
+        if r <= 0:
+            return None
+        error = 3.0 * math.sqrt(max(1 - r**2, 0.0) / self.spans) / r
+        if self.slope * (1 - error) <= 1 <= self.slope / r**2 * (1 + error):
+            return None
+        return self.slope / r
+
+
+class Line(NamedTuple):
+    """An acceleration over a command: ``slope`` [-] and ``constant`` [m/s^2] with its standard error ``sd``, at their
+    best ``correlation``."""
+
+    slope: float
+    constant: float
+    sd: float
+    correlation: float
+
+
+def line_between(
+    time: NDArray, parts: Sequence[slice], accel: NDArray, command: NDArray, *, delays: Sequence[float]
+) -> Line | None:
+    """Regress means of ``accel`` over the shorter of SPANS_S on those of ``command``, both ``(time,)``, before it by
+    one of ``delays`` [s]; None where there are fewer than MIN_SPANS spans or the command does not move."""
+    span, best = SPANS_S[0], None
+    for delay in delays:
+        means: list[NDArray] = []
+        for part in parts:
+            t = time[part]
+            if len(t) < 3:
+                continue
+            at = np.arange(t[0] + delay, t[-1] - span, span)
+            totals = [
+                np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(t))])
+                for y in (accel[part], command[part])
+            ]
+            ends = (at, at - delay)
+            means.append(
+                np.stack(
+                    [(np.interp(x + span, t, y) - np.interp(x, t, y)) / span for x, y in zip(ends, totals, strict=True)]
+                )
+            )
+        a, u = np.concatenate(means, 1) if means else np.zeros((2, 0))
+        if len(a) < MIN_SPANS or u.std() <= 1e-9 * (1 + np.abs(u).max()) or a.std() == 0:
+            continue
+        r = float(np.corrcoef(u, a)[0, 1])
+        if best is None or r > best.correlation:
+            slope = r * float(a.std() / u.std())
+            left = float(np.sqrt(np.mean((a - a.mean() - slope * (u - u.mean())) ** 2)))
+            sd = left / math.sqrt(len(a)) * math.sqrt(1 + float(u.mean() / u.std()) ** 2)
+            best = Line(slope, float(a.mean() - slope * u.mean()), sd, r)
+    return best
 
 
 def scale_between(
@@ -82,7 +145,7 @@ def _compare(totals: list[tuple[NDArray, NDArray, NDArray]], span: float, delay:
     if sx <= 1e-9 * (1 + np.abs(change).max()) or sy <= 1e-9 * (1 + np.abs(integral).max()):
         return None
     correlation = float(np.mean((change - change.mean()) * (integral - integral.mean())) / (sx * sy))
-    return Scale(correlation * sx / sy, correlation, sx / span)
+    return Scale(correlation * sx / sy, correlation, sx / span, spans)
 
 
 def _rank(found: Scale) -> tuple[bool, float]:

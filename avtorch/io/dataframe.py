@@ -11,6 +11,7 @@ from typing import Any, Protocol
 from avtorch.errors import InputError, printable, quoted
 from avtorch.io.arrow_cells import cells_of, scalar_checks
 from avtorch.io.tables import Table
+from avtorch.io.whole_stamps import with_whole_stamps
 
 _INDEX = "__index_level_0__"  # pandas' own name for an index without one
 
@@ -65,9 +66,9 @@ def frame_table(frame: DataFrame, source: str = "DataFrame") -> Table:
         for i, name in enumerate(names)
     ]
     kept = [i for i, column in enumerate(cells) if column is not None]
-    return Table(
-        source, tuple(str(names[i]) for i in kept), tuple(cells[i] for i in kept), form=f"a {type(frame).__name__}"
-    )
+    form = f"a {type(frame).__name__}"
+    both = with_whole_stamps(tuple(str(names[i]) for i in kept), tuple(cells[i] for i in kept))
+    return Table(source, *both, form=form)
 
 
 def _interchanged(frame: DataFrame) -> Any:

@@ -33,8 +33,9 @@ from avtorch.io.validity import check_units
 if TYPE_CHECKING:
     import pandas
 
-STANDSTILL_MPS = 0.3
-"""Below this speed GLVD does not hold; such rows are masked.
+STANDSTILL_MPS, STANDSTILL_SHARE = 0.3, 0.1
+"""Below this speed [m/s] GLVD does not hold; such rows are masked. What never goes ten times as fast, a small robot,
+stands below a tenth of its own top speed (`Log.standstill_mps`).
 
 Example:
     >>> import numpy as np
@@ -272,11 +273,18 @@ class Log(Displayed):
         return 1 / median_step(self.elapsed, np.diff(self.segment) == 0)
 
     @cached_property
+    def standstill_mps(self) -> float:
+        """The speed [m/s] below which it stands: `STANDSTILL_MPS`, and at most a tenth of its top speed."""
+        if self.speed is None:
+            return STANDSTILL_MPS
+        return min(STANDSTILL_MPS, STANDSTILL_SHARE * float(np.quantile(np.abs(self.speed), 0.99)))
+
+    @cached_property
     def moving(self) -> BoolArray:
         """Rows not at standstill, ``(time,)``; without speed, detected from the response to the brake
         (``standing``)."""
         if self.speed is not None:
-            return self.speed >= STANDSTILL_MPS
+            return self.speed >= self.standstill_mps
         moving = np.ones(self.rows, bool)
         if self.accel is None or self.accel_cmd is None:  # pedals alone do not tell a car at rest from one at speed
             return moving

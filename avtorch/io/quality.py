@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.errors import listed
+from avtorch.errors import InputError, listed
 from avtorch.io.clock import clock_words
-from avtorch.io.consistency import scale_between
+from avtorch.io.consistency import line_between, scale_between
 from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import Log
 from avtorch.io.mapping import PEDALS
 from avtorch.io.segments import median_step, stretches
-from avtorch.io.validity import command_scale
+from avtorch.io.validity import DELAYS_S, command_scale
+
+LEAST_S = 2.0
+"""The shortest stretch [s] of which anything is estimated: the lag and dead time of a car, and as long again."""
+_CONSTANT_MPS2 = 1.0  # an accelerometer tilted by 6 degrees, or a road of 10 %: no larger constant has these causes
+_CALIBRATED = 0.05  # share by which a wheel's wear, a tyre's pressure and a sensor's calibration change a scale
 
 SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead_accel", "grade", *PEDALS, "speed_cmd")
 
@@ -46,7 +52,8 @@ class Quality:
     ``epoch_s``: time of the first row [s], from which ``notes`` count; ``jitter``: 95 % point of the deviation of a
     step from the median one, as its share [-]; ``late_rows``: steps over 1.5 median ones that are no gap;
     ``masked_rows``: rows not usable, of which ``driver_rows`` not engaged, ``settling_rows`` within 2 s of one of
-    ``returns`` to engaged and ``standstill_rows`` below 0.3 m/s or, without speed, classified as standing; ``notes``:
+    ``returns`` to engaged and ``standstill_rows`` below 0.3 m/s, or a
+    tenth of the top speed where that is less, or, without speed, classified as standing; ``notes``:
     all of it in sentences.
 
     Example:
@@ -139,7 +146,7 @@ def check(log: Log) -> Quality:
             f"{settling * step:.1f} s of settling masked ({SETTLE_S:g} s after each)"
         )
     if still:
-        how = "below 0.3 m/s" if log.speed is not None else "braked, yet not slowing"
+        how = f"below {log.standstill_mps:.2g} m/s" if log.speed is not None else "braked, yet not slowing"
         notes.append(f"{still} rows masked: standstill ({how})")
     if masked == log.rows:
         notes.append("no row is left to estimate from")
@@ -197,9 +204,12 @@ def _doubtful_units(log: Log) -> list[str]:
             notes.append(f"speed reaches {top:.3g} m/s (median {middle:.3g}): could it be km/h? `--unit speed=km/h`")
     if log.speed is not None and log.accel is not None:
         found = scale_between(log.elapsed, parts, log.speed, log.accel)
-        if found is not None and found.correlation > 0.9 and not 0.8 <= found.slope <= 1.25:
+        times = None if found is None else found.factor
+        if times is not None and found is not None and found.correlation > 0.9 and abs(math.log(times)) > _CALIBRATED:
             notes.append(
-                f"speed changes {found.slope:.3g} times as much as accel implies: a unit or a sensor's scale is wrong"
+                f"speed changes {times:.3g} times as much as accel implies: a unit, the accelerometer's scale or the "
+                "speed's, such as a wheel's radius, is wrong. A known distance tells which; until then the car's gain "
+                "is open by as much"
             )
     if log.accel_cmd is not None:
         found = command_scale(log.elapsed, parts, log.speed, log.accel, log.accel_cmd)
@@ -208,6 +218,7 @@ def _doubtful_units(log: Log) -> list[str]:
             notes.append(
                 f"{channel} responds with {found.slope:.3g} times the command: units of {channel} or accel_cmd?"
             )
+        notes += _constant(log, parts)
     if log.speed is None and log.accel is not None and log.accel_cmd is not None:
         top = max(float(np.abs(log.accel).max()), float(np.abs(log.accel_cmd).max()))
         if 0 < top < 0.6:
@@ -223,12 +234,46 @@ def _doubtful_units(log: Log) -> list[str]:
     return notes
 
 
+def _constant(log: Log, parts: list[slice]) -> list[str]:
+    """A constant between command and motion that is neither a sensor's offset nor a road."""
+    motion = log.accel
+    if motion is None and log.speed is not None:
+        motion = np.gradient(log.speed, log.elapsed)
+    if motion is None or log.accel_cmd is None:
+        return []
+    line = line_between(log.elapsed, parts, motion, log.accel_cmd, delays=DELAYS_S)
+    if line is None or line.correlation < 0.8 or abs(line.constant) - 3 * line.sd < _CONSTANT_MPS2:
+        return []
+    channel = "accel" if log.accel is not None else "speed's derivative"
+    return [
+        f"{channel} is {line.slope:.3g} times the command {'plus' if line.constant > 0 else 'minus'} "
+        f"{abs(line.constant):.3g} m/s² (SE {line.sd:.1g}): is gravity or a feed-forward left in one of them? "
+        "Take it off first: lag and gain that are estimated with it are wrong"
+    ]
+
+
+def require_usable(log: Log) -> None:
+    """Raises `InputError` for a log of which too little is left (`LEAST_S`)."""
+    if not log.usable.any():
+        raise InputError(
+            f"{log.name}: has no row to use; all are driven by hand (engaged 0), within 2 s after, or at standstill"
+        )
+    longest = max(log.elapsed[p.stop - 1] - log.elapsed[p.start] for p in stretches(log.usable, log.segment))
+    if longest < LEAST_S:
+        still = f"; {float((~log.moving).mean()):.0%} of the rows are below {log.standstill_mps:.2g} m/s"
+        raise InputError(
+            f"{log.name}: too little is left to use: the longest stretch lasts {longest:.2g} s, needs {LEAST_S:g} s or "
+            f"more{still if not log.moving.all() else ''}"
+        )
+
+
 def _disagreements(log: Log) -> list[str]:
     if log.speed is None or log.accel is None:
         return []
     found = scale_between(log.elapsed, stretches(log.usable, log.segment), log.speed, log.accel)
-    # 0.5 m/s in a second is well above noise and grade
-    if found is None or found.change < 0.5 or found.correlation >= 0.5:
+    # 0.5 m/s in a second, or a twentieth of the top speed of what is slower, is well above noise and grade
+    plain = min(0.5, 0.05 * float(np.abs(log.speed).max()))
+    if found is None or found.change < plain or found.correlation >= 0.5:
         return []
     r = f"{found.correlation:.2f}"
     return [f"speed's derivative and accel disagree (correlation {r}): one of them is not this car's motion"]

@@ -24,6 +24,7 @@ from avtorch.io.text.encoding import decoded, unzipped
 from avtorch.io.text.layout import Layout, cells_of, layout_of
 from avtorch.io.text.rows import rows_of
 from avtorch.io.text.time_stamps import is_time, seconds_of
+from avtorch.io.whole_stamps import with_halves, with_whole_stamps
 from avtorch.numeral import numeral
 
 _LINES_AHEAD = 100  # lines searched for a header that other lines precede
@@ -103,7 +104,8 @@ class Table:
                     faults[row] = f"{self.where(row, column)}: {quoted(str(cells[row]), 30)} is no time"
             empty = np.isnan(values)
         else:
-            values, empty = self._parse(cells, column, empty_is_nan, as_state, faults)
+            need = _TIME if as_time else "a number is needed"
+            values, empty = self._parse(cells, column, empty_is_nan, as_state, faults, need)
             remarks = ()
         for row in np.flatnonzero(~np.isfinite(values) & ~empty).tolist():
             if row not in faults:
@@ -114,7 +116,13 @@ class Table:
         return Readings(values, faults, remarks)
 
     def _parse(
-        self, cells: Sequence[Any], column: str, empty_is_nan: bool, as_state: bool, faults: dict[int, str]
+        self,
+        cells: Sequence[Any],
+        column: str,
+        empty_is_nan: bool,
+        as_state: bool,
+        faults: dict[int, str],
+        need: str,
     ) -> tuple[FloatArray, NDArray]:
         values = np.full(len(cells), math.nan)
         empty = np.zeros(len(cells), dtype=bool)
@@ -129,9 +137,9 @@ class Table:
                 if as_state and isinstance(cell, str) and cell.strip().lower() in _STATES:
                     values[row] = _STATES[cell.strip().lower()]
                 elif blank:
-                    faults[row] = f"{self.where(row, column)}: is empty; a number is needed"
+                    faults[row] = f"{self.where(row, column)}: is empty; {need}"
                 else:
-                    faults[row] = f"{self.where(row, column)}: {_no_number(cell)}"
+                    faults[row] = f"{self.where(row, column)}: {_no_number(cell, need)}"
         return values, empty
 
     def _numeral(self, cell: str) -> float:
@@ -149,6 +157,7 @@ class Readings:
     remarks: tuple[str, ...] = ()
 
 
+_TIME = "a time is needed: a number, or as 2024-04-23 12:31:47.388 or 12:31:47.388"
 _STATES = {"true": 1.0, "false": 0.0, "on": 1.0, "off": 0.0, "yes": 1.0, "no": 0.0}
 
 
@@ -166,9 +175,11 @@ def _number(cell: Any) -> float:
         return math.inf
 
 
-def _no_number(cell: Any) -> str:
+def _no_number(cell: Any, need: str) -> str:
     if not isinstance(cell, str):
-        return f"a {type(cell).__name__} is no number; a number is needed"
+        return f"a {type(cell).__name__} is no number; {need}"
+    if need == _TIME and not is_time(cell):
+        return f"{quoted(cell, 30)} is no number, and no time of a known form; {need}"
     return f"{quoted(cell, 30)} is no number; a number is needed"
 
 
@@ -184,11 +195,12 @@ def read_table(path: str | os.PathLike[str], *, header: str | None = None, wante
     """
     file = Path(path)
     raw = read_bytes(file)
+    wanted = None if wanted is None else with_halves(wanted)
     if raw[:4] == b"PAR1":
         from avtorch.io.parquet import read_parquet
 
         names, cells = read_parquet(raw, place(file), wanted)
-        return Table(place(file), names, cells, form="Parquet")
+        return Table(place(file), *with_whole_stamps(names, cells), form="Parquet")
     if file.suffix.lower() in (".parquet", ".pq"):
         raise InputError(f"{place(file)}: named as Parquet but its content is not; write it anew, or name it .csv")
     text, remarks = decoded(place(file), raw)
@@ -229,7 +241,8 @@ def text_table(source: str, text: str, header: str | None, wanted: Wanted | None
     read = dict(zip(kept, columns, strict=True))
     cells = tuple(read.get(i) for i in range(len(names)))
     form = f"text, {layout.words}"
-    return Table(source, names, cells, lines, decimal=layout.decimal, units=units, faults=faults, form=form)
+    both = with_whole_stamps(names, cells)
+    return Table(source, *both, lines, decimal=layout.decimal, units=units, faults=faults, form=form)
 
 
 def _line_of(text: str, layout: Layout, first_cell: str) -> int:

@@ -45,7 +45,7 @@ _UNITS: dict[str, dict[str, float]] = {
     "lead_accel": _ACCEL,
     "grade": _GRADE,
     "throttle": _SHARE,
-    "brake": _SHARE | _PRESSURE,
+    "brake": _SHARE | _PRESSURE | _TORQUE,
     "torque": _TORQUE,
     "current": _CURRENT,
     "speed_cmd": _SPEED,
@@ -56,7 +56,7 @@ SI = {
     **{"lead_speed": "m/s", "lead_accel": "m/s²", "grade": "-", "throttle": "-", "brake": "-", "torque": "Nm"},
     **{"current": "A", "speed_cmd": "m/s"},
 }
-"""The unit in which a log holds each signal; a brake may be a pressure [Pa] instead of a share."""
+"""The unit in which a log holds each signal; a brake may be a pressure [Pa] or a torque [Nm] instead of a share."""
 
 
 def to_si(signal: str, unit: str) -> Callable[[NDArray], NDArray]:

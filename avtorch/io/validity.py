@@ -154,7 +154,7 @@ SPEED_FACTORS = {"km/h": 3.6, "mph": 3600 / 1609.344, "ft/s": 1 / 0.3048, "cm/s"
 ACCEL_FACTORS = {"g": GRAVITY, "cm/s2": 0.01, "mm/s2": 0.001, "ft/s2": 0.3048, "km/h/s": 1 / 3.6}
 
 
-_DELAYS_S = tuple(np.arange(0, 1.01, 0.1))
+DELAYS_S = tuple(np.arange(0, 1.01, 0.1))
 
 
 def command_scale(
@@ -169,7 +169,7 @@ def command_scale(
         level = np.concatenate([[0.0], np.cumsum(0.5 * (accel[1:] + accel[:-1]) * np.clip(np.diff(time), 0, 1))])
     else:
         level = speed
-    found = scale_between(time, parts, level, u, delays=_DELAYS_S)
+    found = scale_between(time, parts, level, u, delays=DELAYS_S)
     if found is not None and found.slope < 0 and found.correlation <= -_SURE:
         later, possible = late_response(time, parts, level, u)
         if possible:

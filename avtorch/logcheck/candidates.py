@@ -14,11 +14,13 @@ from avtorch.io.merge import held
 from avtorch.io.merged import merged
 from avtorch.io.recording import Recording
 from avtorch.io.tables import Table
+from avtorch.io.whole_stamps import whole_stamps
 from avtorch.logcheck.header import Header, header_of
 from avtorch.logcheck.vocabulary import likeness, signals_named
 
 _MOST = 5  # columns that are tried for a signal
 _KNOWN = 3.0  # likeness of a column of a known layout
+_STAMP = 1.5  # likeness of a stamp in seconds and nanoseconds, which only avtorch's own name for the clock exceeds
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,7 @@ def columns_of(table: Table) -> list[Column]:
     """The columns of a table that hold numbers or times, but for a twentieth of their cells."""
     found = []
     preset, known = layout_of(table.names)
+    stamps = whole_stamps(table.names)
     for name in dict.fromkeys(table.names):
         if table.names.count(name) > 1:
             continue
@@ -49,6 +52,7 @@ def columns_of(table: Table) -> list[Column]:
         header = header_of(name, unit or table.units.get(name))
         alike = {signal: x for signal in signals_named() if (x := likeness(header, signal)) > 0 and signal not in known}
         alike |= dict.fromkeys(layout, _KNOWN)
+        alike |= dict.fromkeys(("time",) if name in stamps else (), _STAMP)
         read = table.readings(name, empty_is_nan=True, as_time="time" in alike, as_state=True)
         if len(read.values) and len(read.faults) <= MOST_BAD * len(read.values) and np.isfinite(read.values).any():
             when = next((source.when for source in layout.values()), ())

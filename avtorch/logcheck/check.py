@@ -15,7 +15,7 @@ from avtorch.io.formats import is_recording, open_recording
 from avtorch.io.log import Log
 from avtorch.io.mapping import Pairs, mapping_beside
 from avtorch.io.opening import place
-from avtorch.io.quality import Quality
+from avtorch.io.quality import Quality, require_usable
 from avtorch.io.quality import check as check_quality
 from avtorch.io.source import LogSource, as_log
 from avtorch.io.tables import read_table
@@ -28,8 +28,8 @@ from avtorch.logcheck.recorder import excitation_notes, recorder_notes
 @dataclass(frozen=True, repr=False)
 class LogCheck(Displayed):
     """A log's `source` and `form`; the `proposal` of how to read it (None: it was read as its mapping says, or was no
-    file); the `log` and its `quality`, None where it cannot be read, and then the `fault`; notes on the `recorder` and
-    on the `excitation`. `follows`: the log is of cars that follow, without commands.
+    file); the `log` and its `quality`, None where it cannot be read; the `fault` where it cannot be used; notes on the
+    `recorder` and on the `excitation`. `follows`: the log is of cars that follow, without commands.
 
     Example:
         >>> import numpy as np
@@ -103,8 +103,8 @@ def check(log: LogSource, *, map: Pairs = None, unit: Pairs = None) -> LogCheck:
     """Check a log before anything is estimated from it.
 
     Of a file without a mapping beside it, and of a data frame, names and units of the columns are proposed, and it is
-    read as proposed. A file with one is read as that says, and either with `map` or `unit` as these say. Raises
-    `InputError` for what is no table of text, no Parquet file and no recording of a known format.
+    read as proposed. A file with one is read as that says. `map` and `unit` name some of the columns; the others are
+    proposed. Raises `InputError` for what is no table of text, no Parquet file and no recording of a known format.
 
     Example:
         >>> import avtorch
@@ -117,15 +117,13 @@ def check(log: LogSource, *, map: Pairs = None, unit: Pairs = None) -> LogCheck:
         return _seen(log.name, "a log in memory", None, as_log(log, map=map, unit=unit))
     if is_dataframe(log):
         frame = frame_table(log)  # pyright: ignore[reportArgumentType]
-        return _read(log, frame.form, None if map or unit else propose(frame), map, unit)
+        return _read(log, frame.form, propose(frame, map=map, unit=unit))
     if not isinstance(log, (str, os.PathLike)):
         return _seen("", "", None, as_log(log))
-    if map or unit:
-        return _read(log, "a file", None, map, unit)
     table = table_of(open_recording(log)) if is_recording(log) else read_table(log)
     if mapping_beside(log) is not None:
-        return _read(log, table.form, None)
-    return _read(log, table.form, propose(table))
+        return _read(log, table.form, None, map, unit)
+    return _read(log, table.form, propose(table, map=map, unit=unit))
 
 
 def _read(
@@ -149,7 +147,8 @@ def _read(
         platoon = _platoon(path) if unknown and path is not None else None
         if platoon is not None:
             return replace(_seen(source, form, None, platoon), follows=True)
-        return LogCheck(source, form, proposal, None, None, str(fault), (), ())
+        clock = None if proposal is None or proposal.signals else f"{source}: {proposal.doubts[0]}"
+        return LogCheck(source, form, proposal, None, None, clock or str(fault), (), ())
     return _seen(source, form, proposal, read)
 
 
@@ -162,6 +161,10 @@ def _platoon(path: str | os.PathLike[str]) -> Log | None:
 
 
 def _seen(source: str, form: str, proposal: Proposal | None, log: Log) -> LogCheck:
-    quality = check_quality(log)
+    quality, fault = check_quality(log), None
+    try:
+        require_usable(log)
+    except InputError as too_little:
+        fault = str(too_little)
     excitation = [*excitation_notes(log), duration_note(log, quality.jitter)]
-    return LogCheck(source, form, proposal, log, quality, None, tuple(recorder_notes(log)), tuple(excitation))
+    return LogCheck(source, form, proposal, log, quality, fault, tuple(recorder_notes(log)), tuple(excitation))

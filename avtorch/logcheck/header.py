@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from itertools import chain
 
 from avtorch.io.unit_names import unit_named
 
@@ -20,17 +21,15 @@ _BARE = {"g": {"accel", "accel_cmd"}, "ms": {"time"}, "s": {"time"}}
 class Header:
     """A column's `name`, its `words` in lower case, and the `unit` it states in avtorch's spelling, or None.
 
-    `bare`: a last word that may be a unit or part of the name, such as the g of `acc_g`.
+    `bare`: a last word that may be a unit or part of the name, such as the g of `acc_g`. `endings`: the words of the
+    last part of a path, of the last two, and so on to all.
     """
 
     name: str
     words: tuple[str, ...]
     unit: str | None = None
     bare: str | None = None
-
-    @property
-    def joined(self) -> str:
-        return "".join(self.words)
+    endings: tuple[tuple[str, ...], ...] = ()
 
 
 def header_of(name: str, stated: str | None = None) -> Header:
@@ -45,11 +44,15 @@ def header_of(name: str, stated: str | None = None) -> Header:
             bare = found
         else:
             rest, unit = behind["name"], unit or found
-    words = tuple(word.lower() for word in _WORDS.findall(rest))
-    if unit is None and bare is None and words and (found := _inside(words[-1])) is not None:
-        unit, words = found
-        words = (*tuple(word.lower() for word in _WORDS.findall(rest))[:-1], words)
-    return Header(name, words, unit, bare)
+    parts = [_words(part) for part in rest.split("/")]
+    if unit is None and bare is None and parts[-1] and (found := _inside(parts[-1][-1])) is not None:
+        unit, parts[-1] = found[0], (*parts[-1][:-1], found[1])
+    endings = [tuple(chain.from_iterable(parts[i:])) for i in reversed(range(len(parts)))]
+    return Header(name, endings[-1], unit, bare, tuple(dict.fromkeys(words for words in endings if words)))
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(word.lower() for word in _WORDS.findall(text))
 
 
 def _inside(word: str) -> tuple[str, str] | None:

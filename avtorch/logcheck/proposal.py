@@ -3,33 +3,28 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import printable
-from avtorch.io.bad_rows import MOST_BAD, codes
-from avtorch.io.consistency import scale_between
-from avtorch.io.mapping import PEDALS
+from avtorch.io.bad_rows import MOST_BAD
+from avtorch.io.mapping import Pairs, SignalMap, given_mapping
 from avtorch.io.segments import gap_limit, stretches
 from avtorch.io.tables import Table
-from avtorch.io.unit_names import stated_unit
+from avtorch.logcheck.assignment import MOTION, assign, filled, is_state
 from avtorch.logcheck.candidates import Column, columns_of, ranked
-from avtorch.logcheck.header import bare_unit
+from avtorch.logcheck.commands import COMMANDS, commands_of, unit_of_command
+from avtorch.logcheck.header import bare_unit, header_of
 from avtorch.logcheck.joint_units import UnitTest, factor, units_together
 from avtorch.logcheck.order_of_events import lateness
+from avtorch.logcheck.vocabulary import likeness, signals_named
 
-_MOTION = ("accel_cmd", "accel", "speed")
-_COMMANDS = (*PEDALS, "speed_cmd")
-_MOST_SHARE, _MOST_PERCENT = 1.2, 120.0  # of a pedal's way; it may be calibrated a little wrongly
 _TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _RATES_HZ = (9.5, 210.0)
-_LARGEST = 1e9  # of a speed or an acceleration, in any unit
-_TRIED = 60  # columns without a telling name that are compared with the others
-_MOST_STATES = 8  # numbers of a column that says who drives
-_ONE_MOTION, _FOLLOWS = 0.9, 0.8  # correlations from which a column without a name is taken
+_FOLLOWS = 0.8  # correlation of a response with its command from which their order means something
 # a response that comes so long before its command, and so many rows, by so much more correlation
 _EARLY_S, _EARLY_ROWS, _PLAINLY = 0.08, 2.0, 0.01
 
@@ -97,38 +92,63 @@ def _toml_text(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def propose(table: Table) -> Proposal:
-    """Names and units of the signals of a table."""
+def propose(table: Table, *, map: Pairs = None, unit: Pairs = None) -> Proposal:
+    """Names and units of the signals of a table; `map` and `unit` name some of them, as `Log.read` takes them."""
+    stated = given_mapping(SignalMap(), map=map, unit=unit)
+    given = stated.column
     columns = columns_of(table)
-    time, clock = _time(columns)
+    time, clock = _time([c for c in columns if c.name == given.get("time", c.name)])
     if time is None or clock is None:
-        return Proposal({}, ("no column rises from row to row at 10 to 200 Hz as a time does",))
+        return Proposal({}, (_no_time(table),))
     known = np.flatnonzero(np.isfinite(clock))
-    found: dict[str, Column] = {}
-    reasons: dict[str, list[str]] = {}
     parts = _parts(clock)
+    doubts: list[str] = _twice(table)
     left = [column for column in columns if column.name != time.column]
-    for signal in _MOTION:
-        _by_name(signal, left, found, reasons)
-    doubts: list[str] = []
-    _by_motion(clock, parts, left, found, reasons, doubts)
-    _swapped(clock, parts, found, reasons)
+    assigned = assign(clock, parts, left, {signal: given[signal] for signal in MOTION if signal in given})
+    found, reasons = assigned.found, assigned.reasons
+    doubts += assigned.doubts
+    if not {"accel_cmd", "accel"} & set(given):
+        _swapped(clock, parts, found, reasons)
     units = _units(clock, parts, found, reasons, doubts)
     signals = {"time": time}
-    for signal in _MOTION:
-        if signal in found:
-            signals[signal] = _proposed(found[signal], units.get(signal), reasons[signal], known)
-        elif signal == "accel_cmd" and not any(ranked(left, name) for name in _COMMANDS):
-            doubts.append("no column looks like the commanded acceleration; name it with --map accel_cmd=COLUMN")
+    signals |= {s: _proposed(found[s], units.get(s), reasons[s], known) for s in MOTION if s in found}
     if "accel" not in found and "speed" not in found:
         doubts.append("no column looks like the car's speed or acceleration; name one with --map speed=COLUMN")
-    used = {one.column for one in signals.values()}
+    used = {one.column for one in signals.values()} | set(given.values())
     left = [column for column in left if column.name not in used]
-    for signal, one in _others(left, signals, found, known).items():
-        signals[signal] = one
+    commands, asked = commands_of(left, given, "accel_cmd" in {**signals, **given})
+    doubts += asked
+    for signal, column in commands.items():
+        unit_of, doubt = unit_of_command(signal, column)
+        reason = [_by_what(column), *([f"in {unit_of}"] if unit_of else [])]
+        signals[signal] = _proposed(column, unit_of, reason, known)
+        doubts += [] if doubt is None or signal in stated.unit else [doubt]
+    signals |= _others(left, {**signals, **dict.fromkeys(given)}, signals, found, known)
+    if not {"accel_cmd", *COMMANDS} & {*signals, *given} and not any("accel_cmd=" in doubt for doubt in doubts):
+        doubts.append("no column looks like the commanded acceleration; name it with --map accel_cmd=COLUMN")
     if "engaged" not in signals:
         doubts += _states(left)
+    for signal in {**given, **stated.unit}:
+        one = signals.get(signal) or Proposed(given.get(signal, signal), None, False, "as given")
+        signals[signal] = replace(one, unit=stated.unit.get(signal, one.unit))
     return Proposal(signals, tuple(doubts))
+
+
+def _twice(table: Table) -> list[str]:
+    """Names that several columns have, of which none can be told from the other."""
+    names = [name for name in dict.fromkeys(table.names) if table.names.count(name) > 1]
+    told = [name for name in names if any(likeness(header_of(name), signal) for signal in signals_named())]
+    return [f"{table.names.count(name)} columns are called {name}; rename all but the right one" for name in told]
+
+
+def _no_time(table: Table) -> str:
+    """What is wrong with the column that is named as the clock."""
+    for name in dict.fromkeys(table.names):
+        if likeness(header_of(name), "time") and table.names.count(name) == 1:
+            faults = table.readings(name, as_time=True).faults
+            if len(faults) > MOST_BAD * table.rows:
+                return faults[min(faults)].removeprefix(f"{table.source}: ")
+    return "no column rises from row to row at 10 to 200 Hz as a time does"
 
 
 def _states(columns: list[Column]) -> list[str]:
@@ -136,8 +156,8 @@ def _states(columns: list[Column]) -> list[str]:
     doubts = []
     for column in ranked(columns, "engaged"):
         numbers = np.unique(column.values[np.isfinite(column.values)])
-        if 2 <= len(numbers) <= _MOST_STATES and (numbers == np.round(numbers)).all():
-            name, told = printable(column.name, 30), ", ".join(f"{x:g}" for x in numbers)
+        if len(numbers) >= 2 and is_state(column):
+            name, told = column.name, ", ".join(f"{x:g}" for x in numbers)
             where = "with --map engaged=COLUMN and in the file beside the log, under [state], the numbers that mean it"
             doubts.append(f"{name} ({told}) may say when the controller drives; if so, name it {where}")
     return doubts
@@ -174,91 +194,15 @@ def _parts(clock: FloatArray) -> list[slice]:
     return stretches(good, np.cumsum(broken).astype(np.int64))
 
 
-def _by_name(signal: str, columns: list[Column], found: dict[str, Column], reasons: dict[str, list[str]]) -> None:
-    taken = {column.name for column in found.values()}
-    named = [column for column in ranked(columns, signal) if column.name not in taken and _moves(column)]
-    if named:
-        found[signal], reasons[signal] = named[0], [_by_what(named[0])]
-        others = [c.name for c in named[1:] if c.likeness[signal] > 0.9 * named[0].likeness[signal]]
-        if others:
-            reasons[signal].append(f"as well as {', '.join(printable(name, 30) for name in others)}")
-
-
 def _by_what(column: Column) -> str:
     return f"by the layout of {column.layout}" if column.layout else "by its name"
-
-
-def _by_motion(
-    clock: FloatArray, parts: list[slice], columns: list[Column], found: dict[str, Column],
-    reasons: dict[str, list[str]], doubts: list[str],
-) -> None:  # fmt: skip
-    """Signals that no name tells, by how they go with the others.
-
-    A car's log holds many columns that go with its speed; one more acceleration is taken only with its unit.
-    """
-    for signal in ("speed", "accel", "accel_cmd"):
-        if signal in found:
-            continue
-        taken = {column.name for column in found.values()}
-        rest = [c for c in columns if c.name not in taken and not c.likeness and _moves(c)][:_TRIED]
-        if signal == "accel":
-            rest = [c for c in rest if c.header.unit in ("m/s2", "g", "mg", "cm/s2", "ft/s2")]
-        best, strength = None, 0.0
-        for column in rest:
-            how_much = _goes_with(signal, _filled(column), clock, parts, found)
-            if how_much > strength:
-                best, strength = column, how_much
-        if best is not None and strength > (_FOLLOWS if signal == "accel_cmd" else _ONE_MOTION):
-            if signal == "accel_cmd" and _one_sided(_filled(best)):
-                doubts.append(
-                    f"the car's motion follows {printable(best.name, 30)} (correlation {strength:.2f}), which is never "
-                    "about zero as an acceleration is; name it with --map throttle=COLUMN, torque=COLUMN or what it is"
-                )
-                continue
-            words = {
-                "speed": "its change is the integral of the acceleration",
-                "accel": "its integral is the change of speed",
-                "accel_cmd": "the car's motion follows it",
-            }[signal]
-            found[signal] = best
-            reasons[signal] = [f"no name tells; {words} (correlation {strength:.2f})"]
-
-
-def _one_sided(values: FloatArray) -> bool:
-    """Whether values (row,) have one sign all along and no zero among the usual ones: a pedal's way, a torque."""
-    low, high = np.quantile(values, (0.01, 0.99))
-    return bool(low > 0 or high < 0)
-
-
-def _goes_with(
-    signal: str, values: FloatArray, clock: FloatArray, parts: list[slice], found: Mapping[str, Column]
-) -> float:
-    """Correlation of a column with the motion that is known, as that signal."""
-    if signal == "accel_cmd":
-        motion = _motion(clock, found)
-        late = None if motion is None else lateness(clock, parts, values, motion)
-        return late.correlation if late is not None and late.seconds > 0 else 0.0
-    other = "accel" if signal == "speed" else "speed"
-    if other not in found:
-        return 0.0
-    pair = (values, _filled(found[other])) if signal == "speed" else (_filled(found[other]), values)
-    scale = scale_between(clock, parts, *pair)
-    return 0.0 if scale is None else abs(scale.correlation)
-
-
-def _motion(clock: FloatArray, found: Mapping[str, Column]) -> FloatArray | None:
-    """The acceleration of the car: the slope of its speed over half a second, whose sign is sure, or measured."""
-    if "speed" in found:
-        speed = _filled(found["speed"])
-        return np.interp(clock + 0.25, clock, speed) - np.interp(clock - 0.25, clock, speed)
-    return _filled(found["accel"]) if "accel" in found else None
 
 
 def _swapped(clock: FloatArray, parts: list[slice], found: dict[str, Column], reasons: dict[str, list[str]]) -> None:
     """Exchanges command and acceleration where what is called the response comes first."""
     if "accel_cmd" not in found or "accel" not in found:
         return
-    late = lateness(clock, parts, _filled(found["accel_cmd"]), _filled(found["accel"]))
+    late = lateness(clock, parts, filled(found["accel_cmd"]), filled(found["accel"]))
     early = max(_EARLY_S, _EARLY_ROWS * float(np.nanmedian(np.diff(clock))))
     if late is None or late.correlation < _FOLLOWS or late.seconds > -early or late.lead < _PLAINLY:
         return
@@ -274,7 +218,7 @@ def _units(
     if not found:
         return {}
     stated = {signal: _stated(signal, column) for signal, column in found.items()}
-    test = units_together(clock, {signal: _filled(column) for signal, column in found.items()}, stated, parts)
+    test = units_together(clock, {signal: filled(column) for signal, column in found.items()}, stated, parts)
     units: dict[str, str] = {}
     for signal, unit in test.best.units.items():
         turned = signal in test.best.turned
@@ -328,21 +272,24 @@ def _proposed(column: Column, unit: str | None, reasons: list[str], known: np.nd
 
 
 def _others(
-    columns: list[Column], signals: Mapping[str, Proposed], found: Mapping[str, Column], known: np.ndarray
+    columns: list[Column],
+    there: Collection[str],
+    signals: Mapping[str, Proposed],
+    found: Mapping[str, Column],
+    known: np.ndarray,
 ) -> dict[str, Proposed]:
-    """Signals besides the motion, by name and by what values they can have."""
+    """Signals besides motion and commands that are not `there`, by name and by what values they can have."""
     out: dict[str, Proposed] = {}
-    for signal in ("engaged", "spacing", "lead_speed", "lead_accel", "grade", "segment", *_COMMANDS):
-        for column in ranked(columns, signal):
+    used = {one.column for one in signals.values()}
+    for signal in ("engaged", "spacing", "lead_speed", "lead_accel", "grade", "segment"):
+        for column in ranked(columns, signal) if signal not in there else ():
             values = column.values[np.isfinite(column.values)]
-            # beside an acceleration they are not needed; one that bears the signal's name is read in any case
-            if signal in _COMMANDS and "accel_cmd" in signals and column.name != signal:
-                continue
-            if any(column.name == one.column for one in out.values()) or not (column.when or _can_be(signal, values)):
+            if column.name in used or not (column.when or _can_be(signal, values)):
                 continue
             unit = _unit_besides(signal, column, signals, found)
             reasons = [_by_what(column)] + ([f"in {unit}"] if unit else [])
             out[signal] = replace(_proposed(column, unit, reasons, known), when=column.when)
+            used.add(column.name)
             break
     return out
 
@@ -361,8 +308,6 @@ def _unit_besides(
     signal: str, column: Column, signals: Mapping[str, Proposed], found: Mapping[str, Column]
 ) -> str | None:
     stated = column.header.unit
-    if signal in _COMMANDS:
-        return _unit_of_command(signal, column)
     if signal == "lead_speed" and "speed" in found and "speed" in signals:
         # it goes about as fast as the car behind it
         ego = np.nanmean(np.abs(found["speed"].values)) * factor("speed", signals["speed"].unit or "m/s")
@@ -374,27 +319,3 @@ def _unit_besides(
         return signals["accel"].unit if "accel" in signals else None
     known = {"spacing": ("cm", "mm", "km", "ft"), "grade": ("%", "deg", "rad"), "lead_accel": ("g", "cm/s2", "ft/s2")}
     return stated if stated in known.get(signal, ()) else None
-
-
-def _moves(column: Column) -> bool:
-    """Whether a column changes, by numbers that a car's motion can have in any unit."""
-    values = column.values[np.isfinite(column.values)]
-    return bool(np.abs(values).max() < _LARGEST and values.min() < values.max())
-
-
-def _unit_of_command(signal: str, column: Column) -> str | None:
-    """Of a pedal, torque, current or speed that is commanded: as stated, or percent where no share is so large."""
-    unit = column.header.unit or bare_unit(column.header, signal)
-    if unit is not None:
-        known = stated_unit(signal, unit)
-        return None if known in (None, "m/s", "Nm", "A", "Pa") else known
-    top = float(np.nanmax(np.abs(column.values)))
-    return "%" if signal in ("throttle", "brake") and _MOST_SHARE < top <= _MOST_PERCENT else None
-
-
-def _filled(column: Column) -> FloatArray:
-    """Values (row,) held where none arrived, or a code for none."""
-    values = column.values
-    known = np.flatnonzero(np.isfinite(values) & ~codes(values))
-    last = np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)
-    return values[known[last]]

@@ -16,6 +16,7 @@ _COARSE = 0.005  # of a signal's SD: a last digit from which it is told
 _AGREE = 0.8  # correlation of two signals whose lateness means something
 _TREMBLES_HZ = 3.0
 _TOLD_MPS2 = 0.02
+_REST_S = 1.0  # a car that stands so long stands still
 
 
 def quantum(values: FloatArray) -> float | None:
@@ -55,6 +56,8 @@ def recorder_notes(log: Log) -> list[str]:
         late = lateness(log.elapsed, parts, log.accel_cmd, motion)
         if late is not None and late.correlation >= _AGREE and 0 <= late.seconds < WITHIN_S:
             notes.append(f"the car follows the command after {late.seconds:.2f} s, lag and dead time together")
+    if (rest := _at_rest(log)) is not None and abs(rest) > _TOLD_MPS2:
+        notes.append(f"accel reads {rest:.2g} m/s² while the car stands: an offset, or a slope where it stood")
     if log.accel is not None and (size := _trembling(log.accel, log.rate_hz)) > _TOLD_MPS2:
         notes.append(f"accel trembles by {size:.2g} m/s² above {_TREMBLES_HZ:g} Hz")
     return notes
@@ -79,8 +82,8 @@ def excitation_notes(log: Log) -> list[str]:
             cannot.append("whether brake and throttle differ: one of them is hardly used")
     if log.speed is not None:
         low, high = np.quantile(log.speed[usable], (0.02, 0.98))
-        can.append(f"speeds from {low:.1f} to {high:.1f} m/s")
-        if high - low < 0.25 * max(high, 1.0):
+        can.append(f"speeds from {low:.2g} to {high:.3g} m/s")
+        if high - low < 0.25 * high:
             cannot.append("what depends on speed, such as drag: speed hardly changes")
     else:
         cannot.append("what depends on speed or place: the log has no speed")
@@ -105,6 +108,15 @@ def _slope(log: Log) -> FloatArray | None:
         return None
     time = log.elapsed
     return (np.interp(time + 0.25, time, log.speed) - np.interp(time - 0.25, time, log.speed)) / 0.5
+
+
+def _at_rest(log: Log) -> float | None:
+    """What the accelerometer reads at rest [m/s²]: its median where speed is zero to the last digit for `_REST_S`."""
+    if log.speed is None or log.accel is None:
+        return None
+    zero = np.abs(log.speed) <= (quantum(log.speed) or 0.0) / 2
+    rows = [log.accel[part] for part in stretches(zero, log.segment) if part.stop - part.start > _REST_S * log.rate_hz]
+    return float(np.median(np.concatenate(rows))) if rows else None
 
 
 def _trembling(values: FloatArray, rate_hz: float) -> float:

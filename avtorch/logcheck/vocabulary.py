@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from itertools import pairwise
 
 from avtorch.logcheck.header import Header
 
@@ -28,7 +29,7 @@ _STATE = {
 }  # fmt: skip
 _ONE_WHEEL = {"fl", "fr", "rl", "rr", "left", "right", "rear"}
 _OF_BRAKES = {
-    "light", "lamp", "switch", "park", "parking", "torque", "temp", "temperature", "on", "disc", "hold",
+    "light", "lamp", "switch", "park", "parking", "temp", "temperature", "on", "disc", "hold",
 }  # fmt: skip
 _OF_STEERING = {"steer", "steering", "driver", "eps", "column", "yaw", "lateral", "hand", "servo", "friction", "loss"}
 _OTHER_FLAGS = {
@@ -91,7 +92,9 @@ _SIGNALS: dict[str, _Wanted] = {
         _ANSWERED | {"body", "valve"},
     ),
     "brake": _Wanted(
-        ({"brake", "brk", "bremse", "bremsdruck"},), _STATE | _ONE_WHEEL | _OF_BRAKES | {"throttle"}, _ANSWERED
+        ({"brake", "brk", "bremse", "bremsdruck"},),
+        _STATE | _ONE_WHEEL | _OF_BRAKES | {"throttle"},
+        _ANSWERED | {"torque"},
     ),
     "torque": _Wanted(
         ({"torque", "drehmoment", "trq", "tq", "moment"},), _STATE | _ONE_WHEEL | _OF_STEERING | {"brake"}, _ANSWERED
@@ -107,17 +110,39 @@ _STEM = 4  # letters from which a word may begin with a wanted one, such as `acc
 
 
 def likeness(header: Header, signal: str) -> float:
-    """How well a name fits a signal: 0 not at all, 1 with nothing besides."""
+    """How well a name fits a signal: 0 not at all, 1 with nothing besides. Of a topic's path the last parts count."""
     if header.name == signal:
         return 2.0
     wanted = _SIGNALS[signal]
-    words = (*header.words, header.joined) if len(header.words) == 2 else header.words
-    if not words or any(_holds(words, group) is None for group in wanted.groups):
+    if any(word in wanted.not_ & (_COMMAND | _LEAD) for word in header.words):
         return 0.0
-    if any(word in wanted.not_ or _begins(word, wanted.not_) for word in header.words):
+    return max((_likeness(words, wanted) for words in header.endings), default=0.0)
+
+
+def _likeness(words: tuple[str, ...], wanted: _Wanted) -> float:
+    both = (*words, *(a + b for a, b in pairwise(words)))
+    if not words or any(_holds(both, group) is None for group in wanted.groups):
         return 0.0
-    spare = max(len(header.words) - len(wanted.groups), 0) + 2.0 * sum(word in wanted.less for word in words)
+    if any(word in wanted.not_ or _begins(word, wanted.not_) for word in words):
+        return 0.0
+    spare = max(len(words) - len(wanted.groups), 0) + 2.0 * sum(word in wanted.less for word in words)
     return 1.0 / (1.0 + 0.15 * spare)
+
+
+def means_otherwise(header: Header) -> bool:
+    """Whether a name says what is no motion along the road: another axis, an angle, a limit, an error."""
+    words = header.endings[0] if header.endings else ()
+    return any(word in _OTHER or _begins(word, _OTHER) for word in words)
+
+
+def is_answer(header: Header) -> bool:
+    """Whether a name says that it was measured."""
+    return any(word in _ANSWERED for word in header.words)
+
+
+def is_asked(header: Header) -> bool:
+    """Whether a name says that it was commanded."""
+    return any(word in _COMMAND or _begins(word, _COMMAND) for word in header.words)
 
 
 def signals_named() -> tuple[str, ...]:

@@ -22,10 +22,11 @@ from avtorch.errors import InputError
 from avtorch.io import atomic
 from avtorch.io.opening import place
 from avtorch.io.tables import Table, read_table
-from avtorch.pedals.pedal_map import UNIT, PedalMap, PedalTable
+from avtorch.pedals.pedal_map import PedalMap, PedalTable, unit_of
 from avtorch.pedals.speed_loop import ERROR, RATE
 
 MAP_FILE, ACCEL_FILE, BRAKE_FILE = "pedal_map.csv", "accel_map.csv", "brake_map.csv"
+_LAST_DIGIT = 0.001  # of an acceleration in a table, m/s²
 _DRIVING = ("throttle", "torque", "current")
 _HEADER = ("pedal", "value", "speed", "accel", "sd")
 _NUMBER = {"coasting": 0, "throttle": 1, "brake": 2, "torque": 3, "current": 4, ERROR: 7, RATE: 8}
@@ -74,7 +75,7 @@ def accel_table(made: PedalMap) -> MapTable | None:
         >>> print(table.text, end="")
         default,0.00,30.00
         0,0.000,-0.600
-        0.1,0.000,-0.600
+        0.1,0.001,-0.599
         1,4.000,1.400
     """
     return _table(made, [name for name in _DRIVING if name in made.pedals], 1.0)
@@ -103,15 +104,34 @@ def _table(made: PedalMap, names: Sequence[str], side: float) -> MapTable | None
         if len(rows) < 2:
             continue
         values = np.abs(table.pedal[rows])
-        is_share = name == "throttle" or (name == "brake" and values[-1] <= 1.2)
+        is_share = unit_of(name, values[-1]) == "-"
         share = values if is_share else values / values[-1]
         lost = [f"lag {made.T_L:.3g} s and dead time {made.dead_time:.3g} s"]
         if not is_share:
-            unit = "Pa" if name == "brake" else UNIT[name]
+            unit = unit_of(name, values[-1])
             lost.append(f"the unit of {name}: a pedal of 1 is {values[-1]:.6g} {unit}")
         lost += [f"{other}, which adds to {name}" for other in names if other != name and side > 0]
-        return MapTable(share, made.speed, table.accel[rows] + made.coasting, tuple(lost))
+        accel, flat = _strict(table.accel[rows] + made.coasting, side)
+        if flat:
+            lost.append(
+                f"{flat} steps of {name} that change nothing: {_LAST_DIGIT} m/s² each, so that it can be inverted"
+            )
+        return MapTable(share, made.speed, accel, tuple(lost))
     return None
+
+
+def _strict(accel: FloatArray, side: float) -> tuple[FloatArray, int]:
+    """A table (pedal, speed) that rises (`side` 1) or falls (-1) from row to row by its last digit at least, and how
+    many of its steps did not.
+
+    Readers of such tables look up the pedal of an acceleration, and refuse one that two pedals give.
+    """
+    rise: FloatArray = np.round(side * accel / _LAST_DIGIT).astype(np.float64)
+    steps = np.arange(len(rise))[:, None]
+    # the least table above it whose rows are a digit apart
+    strict = np.asarray(np.maximum.accumulate(rise - steps, axis=0) + steps, dtype=np.float64)
+    flat = int((np.diff(rise, axis=0) < 1).sum())
+    return (side * strict * _LAST_DIGIT if flat else accel), flat
 
 
 def write_map(made: PedalMap, folder: str | PathLike[str]) -> list[Path]:
@@ -162,7 +182,7 @@ def _row(sd: FloatArray | None) -> FloatArray | None:
 
 
 def _units(made: PedalMap) -> str:
-    return ", ".join(f"{UNIT[name]} ({name})" for name in made.pedals)
+    return ", ".join(f"{unit_of(name, np.abs(table.pedal).max())} ({name})" for name, table in made.pedals.items())
 
 
 def read_map(path: str | PathLike[str]) -> PedalMap:

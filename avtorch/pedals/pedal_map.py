@@ -18,7 +18,23 @@ from avtorch.pedals.speed_loop import ERROR, RATE, inputs_of
 
 SIGN = {"throttle": 1.0, "brake": -1.0, "torque": 1.0, "current": 1.0, ERROR: 1.0, RATE: 1.0}
 """Whether more of a pedal makes the car faster or slower."""
-UNIT = {"throttle": "-", "brake": "- or Pa", "torque": "Nm", "current": "A", ERROR: "m/s", RATE: "m/s2"}
+_UNIT = {"throttle": "-", "torque": "Nm", "current": "A", ERROR: "m/s", RATE: "m/s2"}
+_MOST_SHARE, _LEAST_PA = 1.2, 1e5
+"""A brake up to 1.2 is a share of its way; a torque [Nm] never reaches 1e5, the 1 bar [Pa] that the pressure of a
+braking car exceeds."""
+
+
+def unit_of(name: str, largest: float) -> str:
+    """The unit of a pedal in a log, that of a brake by the largest value.
+
+    Example:
+        >>> from avtorch.pedals.pedal_map import unit_of
+        >>> [unit_of("brake", largest) for largest in (1.0, 2760.0, 4e6)]
+        ['-', 'Nm', 'Pa']
+    """
+    if name != "brake":
+        return _UNIT[name]
+    return "-" if largest <= _MOST_SHARE else "Nm" if largest < _LEAST_PA else "Pa"
 
 
 @dataclass(frozen=True, eq=False)

@@ -408,3 +408,12 @@ def test_what_is_not_installed_is_told(build: Build, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "fmpy" else there(name, *rest))
     with pytest.raises(InputError, match=re.escape("pip install 'avtorch[fmu]'")):
         build.open(build.fmu())
+
+
+def test_an_fmu_of_pedals_is_refused_as_that(build: Build) -> None:
+    """Before, a map was asked for, which no FMU of two pedals can be given."""
+    given = fmus.variables()
+    given["u"]["name"] = "throttle"
+    given["omega"] |= {"name": "brake", "causality": "input"}
+    with pytest.raises(InputError, match=r"takes throttle.*brake.*, and no acceleration.*--simulated"):
+        build.open(build.fmu(given=given))

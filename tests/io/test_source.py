@@ -164,7 +164,8 @@ def test_a_check_proposes_how_to_read_a_frame(log: Log) -> None:
     assert found.log is not None
     assert found.log.rows == log.rows
     given = check(frame, map={"time": "Zeit [s]", "accel_cmd": "AccReq", "speed": "VehSpd_kph"}, unit="speed=km/h")
-    assert given.proposal is None
+    assert given.proposal is not None
+    assert {one.reason.split(",")[0] for name, one in given.proposal.signals.items() if name != "time"} == {"as given"}
     assert given.log is not None
     lacking = check(pa.table({"time": [0.0, 0.1]}))
     assert lacking.log is None

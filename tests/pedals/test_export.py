@@ -65,3 +65,35 @@ def test_other_files_are_refused(text: str, told: str, tmp_path: Path) -> None:
     (tmp_path / "map.csv").write_text(text)
     with pytest.raises(InputError, match=told):
         read_map(tmp_path / "map.csv")
+
+
+@pytest.mark.parametrize("name", ["throttle", "brake"])
+def test_a_table_of_plateaus_can_be_inverted(name: str, tmp_path: Path) -> None:
+    """A dead zone, a plateau and a saturation: each command comes back as the pedal that gives it."""
+    sign = -1.0 if name == "brake" else 1.0
+    pedal = np.array([0.0, 0.1, 0.4, 0.6, 0.9, 1.0])
+    accel = sign * np.outer([0.0, 0.0, 1.2, 1.2, 3.0, 3.0], [1.0, 0.7])
+    made = PedalMap(np.array([0.0, 20.0]), np.array([0.05, -0.3]), {name: PedalTable(pedal, accel)})
+    write_map(made, tmp_path)
+    file = "brake_map.csv" if name == "brake" else "accel_map.csv"
+    with open(tmp_path / file, newline="") as stream:
+        _, *rows = list(csv.reader(stream))
+    table = np.array(rows, float)
+    assert np.allclose(table[:, 0], pedal)
+    rising = sign * table[:, 1:]
+    assert (np.diff(rising, axis=0) > 5e-4).all()
+    for column in rising.T:
+        given = np.linspace(column[0], column[-1], 200)
+        back = np.interp(np.interp(given, column, pedal), pedal, column)
+        assert np.allclose(back, given, atol=1e-9)
+    assert np.allclose(table[:, 1:], accel + made.coasting, atol=0.0065), "each flat step costs one digit"
+    written = brake_table(made) if name == "brake" else accel_table(made)
+    assert written is not None
+    assert any("steps of" in words and "inverted" in words for words in written.lost)
+
+
+def test_a_brake_in_newton_metres_is_no_pressure() -> None:
+    brake = PedalTable(np.array([0.0, 2760.0]), np.array([[0.0, 0.0], [-6.0, -6.0]]))
+    table = brake_table(PedalMap(np.array([0.0, 20.0]), np.zeros(2), {"brake": brake}))
+    assert table is not None
+    assert "the unit of brake: a pedal of 1 is 2760 Nm" in table.lost

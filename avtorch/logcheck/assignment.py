@@ -1,0 +1,347 @@
+"""Which columns are command, acceleration and speed: names and data weighed together, in nats.
+
+A name is a prior. The data are how the changes of one column go with the integral of another: of a speed and an
+acceleration the two are one motion, of a command and the motion one follows the other. Each pair's correlation is far
+likelier between the right columns than between others (`_evidence`). The assignment of the highest sum is taken; where
+the next one, of a column that moves otherwise, is within `PLAIN`, or where a column is named as a signal that it does
+not move like, that is a question.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from avtorch.arrays import FloatArray
+from avtorch.io.bad_rows import codes
+from avtorch.io.consistency import MIN_SPANS, SPANS_S
+from avtorch.logcheck.candidates import Column, ranked
+from avtorch.logcheck.header import bare_unit
+from avtorch.logcheck.order_of_events import lateness
+from avtorch.logcheck.vocabulary import means_otherwise
+
+MOTION: tuple[str, ...] = ("accel_cmd", "accel", "speed")
+PLAIN = 3.0
+"""Nats by which a choice must lead another one for that to be ruled out."""
+
+_NAMED, _OWN = 3.0, 6.0
+"""Nats of a name with nothing besides, and of avtorch's own name for a signal or a known layout's: such a column is
+something else once in twenty, and once in four hundred."""
+_OTHERWISE = -3.0
+"""Nats of a name that says something else, such as `lead_speed`, `LatAcc` or `throttle`."""
+_TAKEN = 0.6
+"""Nats from which a column is taken: a correlation of 0.8 where no name tells, or a name that no data contradict."""
+_TOLD = -1.0
+"""Nats of data from which a column is worth a question: a correlation of 0.63 of one motion."""
+_STEEP = {"motion": 7, "response": 3}
+"""Power of the correlation with which its density rises between right columns; a car's answer is looser than one motion
+read twice. Between others it is even."""
+_LOST = 0.05
+"""Share of right columns whose correlation is anything: noise, a slope, a driver at the pedals."""
+_CALM = 0.01
+"""Change within a span, as a share of the top speed, below which a drive tells nothing about names."""
+_ALIKE = 0.98  # correlation from which two columns measure one thing
+_TRIED, _KEPT = 60, 3  # columns without a telling name that are compared with the others, and kept of them
+_DELAYS_S = tuple(np.arange(0, 1.01, 0.1).tolist())
+_MOST_STATES = 8  # numbers of a column that is a flag or a state
+_LARGEST = 1e9  # of a speed or an acceleration, in any unit
+_ACCELS = ("m/s2", "g", "mg", "cm/s2", "ft/s2")
+
+
+@dataclass(frozen=True)
+class Assigned:
+    """The columns `found` by signal, the `reasons` of each, and `doubts`, in sentences."""
+
+    found: dict[str, Column]
+    reasons: dict[str, list[str]]
+    doubts: list[str]
+
+
+def assign(clock: FloatArray, parts: list[slice], columns: list[Column], given: Mapping[str, str]) -> Assigned:
+    """Assigns columns to command, acceleration and speed, whose stamps are `clock` (row,) [s]; `given`: those that the
+    user named."""
+    taken = set(given.values())
+    options: dict[str, list[Column]] = {}
+    moving = [column for column in columns if moves(column)]
+    unnamed = [c for c in moving if c.name not in taken and not c.likeness and not is_state(c)][:_TRIED]
+    for signal in MOTION:
+        if signal in given:
+            options[signal] = [column for column in columns if column.name == given[signal]]
+            continue
+        named = [c for c in ranked(moving, signal) if c.name not in taken and (not is_state(c) or c.name == signal)]
+        rest = [c for c in unnamed if signal != "accel" or _unit_of_accel(c) is not None]
+        options[signal] = [*named, *rest]
+    motion = _Motion(clock, parts, options)
+    options = {s: options[s] if s in given else _promising(s, options, motion) for s in MOTION}
+    choices = sorted(_choices(options, motion, given), key=lambda choice: -choice[0])
+    found, reasons, doubts = {}, {}, []
+    best = choices[0][1]
+    for signal in MOTION:
+        column = best[signal]
+        question = None if signal in given else _question(signal, choices, motion)
+        if question is not None:
+            doubts.append(question)
+        # what bears the signal's own name is read as that in any case
+        if column is None or (question is not None and column.name != signal):
+            continue
+        if signal == "accel_cmd" and not column.likeness and _one_sided(filled(column)):
+            strength = motion.strength(signal, column, best)
+            doubts.append(
+                f"the car's motion follows {column.name} (correlation {strength:.2f}), which is never about zero as an "
+                "acceleration is; name it with --map throttle=COLUMN, torque=COLUMN or what it is"
+            )
+            continue
+        found[signal] = column
+        reasons[signal] = _reasons(signal, column, best, options[signal], motion, signal in given)
+    return Assigned(found, reasons, doubts)
+
+
+def moves(column: Column) -> bool:
+    """Whether a column changes, by numbers that a car's motion can have in any unit."""
+    values = column.values[np.isfinite(column.values)]
+    return bool(np.abs(values).max() < _LARGEST and values.min() < values.max())
+
+
+def is_state(column: Column) -> bool:
+    """Whether a column holds a flag or the numbers of a state: few whole numbers, none below zero."""
+    numbers = np.unique(column.values[np.isfinite(column.values)])
+    return len(numbers) <= _MOST_STATES and bool((numbers == np.round(numbers)).all() and numbers[0] >= 0)
+
+
+def filled(column: Column) -> FloatArray:
+    """Values (row,) held where none arrived, or a code for none."""
+    values = column.values
+    known = np.flatnonzero(np.isfinite(values) & ~codes(values))
+    last = np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)
+    return values[known[last]]
+
+
+class _Motion:
+    """Correlations of the columns: of the changes of each with the integrals of each, over spans of `SPANS_S`."""
+
+    def __init__(self, clock: FloatArray, parts: list[slice], options: Mapping[str, list[Column]]) -> None:
+        self.clock, self.parts = clock, parts
+        self.columns = {column.name: column for signal in MOTION for column in options[signal]}
+        self.number = {name: i for i, name in enumerate(self.columns)}
+        values = [filled(column) for column in self.columns.values()]
+        self.tables = [table for span in SPANS_S if (table := _table(clock, parts, values, span)) is not None]
+
+    def same(self, signal: str, a: Column, b: Column) -> bool:
+        """Whether two columns measure the same."""
+        pick = 0 if signal == "speed" else 1
+        i, j = self.number[a.name], self.number[b.name]
+        found = [abs(float(table[pick][..., i, :].ravel() @ table[pick][..., j, :].ravel())) for table in self.tables]
+        size = len(_DELAYS_S) if pick else 1
+        return max(found, default=0.0) / size > _ALIKE
+
+    def correlation(self, level: Column, rate: Column) -> float | None:
+        """Of changes of `level` and the integral of `rate`; None where the drive does not tell."""
+        return self._best(0, level, rate, 1)
+
+    def response(self, channel: str, answer: Column, command: Column) -> float | None:
+        """Of the motion that `channel` measures and the integral of `command`, up to 1 s later."""
+        return self._best(0 if channel == "speed" else 1, answer, command, len(_DELAYS_S))
+
+    def _best(self, pick: int, answer: Column, rate: Column, delays: int) -> float | None:
+        i, j = self.number[answer.name], self.number[rate.name]
+        found = [
+            float(r)
+            for table in self.tables
+            for r in table[1][:delays, j] @ (table[0][i] if pick == 0 else table[1][0, i])
+        ]
+        if not found:
+            return None
+        # a periodic drive correlates as strongly, with the other sign, half a period off
+        best = max(found, key=lambda r: (r > 0.5, abs(r)))
+        calm = pick == 0 and all(table[2][i] < _CALM for table in self.tables)
+        return None if calm and abs(best) < 0.5 else best
+
+    def pairs(self, of: Mapping[str, Column | None]) -> Iterator[tuple[str, tuple[str, ...], float]]:
+        """What the data say of an assignment: kind of pair, its signals and their correlation."""
+        speed, accel, command = of["speed"], of["accel"], of["accel_cmd"]
+        if speed is not None and accel is not None and (r := self.correlation(speed, accel)) is not None:
+            yield "motion", ("speed", "accel"), r
+        if command is not None:
+            answers = (("speed", speed), ("accel", accel))
+            found = [(r, name) for name, c in answers if c is not None and (r := self.response(name, c, command))]
+            if found:
+                r, name = max(found, key=lambda one: abs(one[0]))
+                yield "response", (name, "accel_cmd"), r
+
+    def strength(self, signal: str, column: Column, of: Mapping[str, Column | None]) -> float:
+        """The strongest correlation of a signal with those of an assignment, 0 where there is none."""
+        return max((r for _, names, r in self.pairs({**of, signal: column}) if signal in names), key=abs, default=0.0)
+
+
+def _table(
+    clock: FloatArray, parts: list[slice], values: list[FloatArray], span: float
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Changes (column, start), integrals (delay, column, start), each of mean 0 and length 1, and the size of the
+    changes as a share of the column's largest value (column,); None where the spans are too few."""
+    last = _DELAYS_S[-1]
+    starts = [np.arange(clock[p][0] + last, clock[p][-1] - span, span / 4) for p in parts if p.stop - p.start > 2]
+    if not starts or sum(map(len, starts)) < 4 * MIN_SPANS:
+        return None
+    changes, integrals, sizes = [], [], []
+    used = [part for part in parts if part.stop - part.start > 2]
+    for x in values:
+        change, by_delay = [], []
+        for part, at in zip(used, starts, strict=True):
+            t, y = clock[part], x[part]
+            total = np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(t))])
+            change.append(np.interp(at + span, t, y) - np.interp(at, t, y))
+            before = at - np.array(_DELAYS_S)[:, None]
+            by_delay.append(np.interp(before + span, t, total) - np.interp(before, t, total))
+        both = np.concatenate(change)
+        sizes.append(float(both.std()) / max(float(np.abs(x).max()), 1e-300))
+        changes.append(_standard(both))
+        integrals.append(_standard(np.concatenate(by_delay, 1)))
+    return np.array(changes), np.array(integrals).transpose(1, 0, 2), np.array(sizes)
+
+
+def _standard(x: FloatArray) -> FloatArray:
+    """Rows of mean 0 and length 1; a constant one, of which rounding alone is left, becomes 0."""
+    x = x - x.mean(-1, keepdims=True)
+    size = np.sqrt((x**2).sum(-1, keepdims=True))
+    return np.where(size > 1e-9 * (1 + np.abs(x).max()), x / np.maximum(size, 1e-300), 0.0)
+
+
+def _evidence(kind: str, correlation: float) -> float:
+    """Nats by which a correlation is likelier between the right columns than between others."""
+    power = _STEEP[kind]
+    return math.log(_LOST + (1 - _LOST) * (power + 1) * abs(correlation) ** power)
+
+
+def _prior(signal: str, column: Column) -> float:
+    alike = column.likeness.get(signal, 0.0)
+    if alike > 1:
+        return _OWN
+    if alike > 0:
+        return _NAMED * (1 + math.log(alike))
+    return _OTHERWISE if column.likeness or means_otherwise(column.header) else 0.0
+
+
+def _score(of: Mapping[str, Column | None], motion: _Motion) -> float:
+    """Nats of an assignment over that of no column at all."""
+    names = sum(_prior(signal, column) - _TAKEN for signal, column in of.items() if column is not None)
+    return names + sum(_evidence(kind, r) for kind, _, r in motion.pairs(of))
+
+
+def _promising(signal: str, options: Mapping[str, list[Column]], motion: _Motion) -> list[Column]:
+    """Columns that a name tells, and the few others that go best with a column of another signal that a name tells."""
+    named = [column for column in options[signal] if signal in column.likeness]
+    others = {name: [c for c in options[name] if name in c.likeness][:_KEPT] for name in MOTION if name != signal}
+    promise: dict[str, float] = {}
+    for column in options[signal]:
+        for name, columns in others.items():
+            for other in columns:
+                if signal not in column.likeness and other.name != column.name:
+                    of = {**dict.fromkeys(MOTION), signal: column, name: other}
+                    gain = sum(_evidence(kind, r) for kind, _, r in motion.pairs(of))
+                    promise[column.name] = max(promise.get(column.name, -math.inf), gain)
+    rest = [column for column in options[signal] if promise.get(column.name, -math.inf) > _TOLD]
+    if signal == "accel_cmd":
+        rest = [column for column in rest if _comes_first(column, others, motion)]
+    return [*named, *sorted(rest, key=lambda column: -promise[column.name])[:_KEPT]]
+
+
+def _comes_first(column: Column, others: Mapping[str, list[Column]], motion: _Motion) -> bool:
+    """Whether a column without a name precedes the car's motion, as a command does and a second sensor does not."""
+    clock = motion.clock
+    for name, columns in others.items():
+        for other in columns[:1]:
+            y = filled(other)
+            if name == "speed":
+                y = np.interp(clock + 0.25, clock, y) - np.interp(clock - 0.25, clock, y)
+            late = lateness(clock, motion.parts, filled(column), y)
+            if late is not None and late.correlation > 0.5 and late.seconds <= 0:
+                return False
+    return True
+
+
+def _choices(
+    options: Mapping[str, list[Column]], motion: _Motion, given: Mapping[str, str]
+) -> Iterator[tuple[float, dict[str, Column | None]]]:
+    none: list[Column | None] = [None]
+    for combination in product(*([*options[s], *(none if s not in given else [])] or none for s in MOTION)):
+        names = [column.name for column in combination if column is not None]
+        if len(set(names)) == len(names):
+            of: dict[str, Column | None] = dict(zip(MOTION, combination, strict=True))
+            yield _score(of, motion), of
+
+
+def _question(signal: str, choices: list[tuple[float, dict[str, Column | None]]], motion: _Motion) -> str | None:
+    """A sentence where another column may be the signal as well, or one is named so and does not move so."""
+    score, best = choices[0]
+    column = best[signal]
+    rest = {name: one for name, one in best.items() if name != signal}
+    said = "its name" if column is not None and signal in column.likeness else "how it moves"
+    if column is None:
+        # with the others as they are: what its name says, or its motion, was not enough
+        near = [
+            (s, of[signal]) for s, of in choices if all(of[n] is c for n, c in rest.items()) and of[signal] is not None
+        ]
+        named = [c for _, c in near if c is not None and signal in c.likeness]
+        # a second sensor moves as a command does, so of commands a name that says otherwise is believed
+        moved = [c for _, c in near if c is not None and signal not in c.likeness and signal != "accel_cmd"]
+        words = [f"{c.name} is named so but moves otherwise ({_with(signal, c, best, motion)})" for c in named[:2]]
+        words += [f"{c.name} moves so ({_with(signal, c, best, motion)}) but is named otherwise" for c in moved[:1]]
+        return f"which column is {signal}? {'; '.join(words)}; name it with --map {signal}=COLUMN" if words else None
+    for other_score, of in choices[1:]:
+        other = of[signal]
+        if score - other_score > PLAIN:
+            break
+        if other is None or other is column or motion.same(signal, column, other):
+            continue
+        return (
+            f"which column is {signal}? {column.name} by {said} ({_with(signal, column, best, motion)}), or "
+            f"{other.name} ({_with(signal, other, of, motion)}); name it with --map {signal}=COLUMN"
+        )
+    return None
+
+
+def _with(signal: str, column: Column, of: Mapping[str, Column | None], motion: _Motion) -> str:
+    """How a column goes with the other signals, in words."""
+    found = [(r, names) for _, names, r in motion.pairs({**of, signal: column}) if signal in names]
+    if not found:
+        return "nothing else in the log tells"
+    r, names = max(found, key=lambda one: abs(one[0]))
+    return f"correlation {r:.2f} with {next(name for name in names if name != signal)}"
+
+
+def _reasons(
+    signal: str, column: Column, best: Mapping[str, Column | None], options: list[Column], motion: _Motion, given: bool
+) -> list[str]:
+    if given:
+        return ["as given"]
+    if signal not in column.likeness:
+        words = {
+            "speed": "its change is the integral of the acceleration",
+            "accel": "its integral is the change of speed",
+            "accel_cmd": "the car's motion follows it",
+        }[signal]
+        return [f"no name tells; {words} (correlation {abs(motion.strength(signal, column, best)):.2f})"]
+    reasons = [f"by the layout of {column.layout}" if column.layout else "by its name"]
+    others = [
+        c.name
+        for c in options
+        if c is not column
+        and c.likeness.get(signal, 0.0) > 0.9 * column.likeness[signal]
+        and motion.same(signal, column, c)
+    ]
+    return [*reasons, f"as well as {', '.join(others)}"] if others else reasons
+
+
+def _one_sided(values: FloatArray) -> bool:
+    """Whether values (row,) have one sign all along and no zero among the usual ones: a pedal's way, a torque."""
+    low, high = np.quantile(values, (0.01, 0.99))
+    return bool(low > 0 or high < 0)
+
+
+def _unit_of_accel(column: Column) -> str | None:
+    unit = column.header.unit or bare_unit(column.header, "accel")
+    return unit if unit in _ACCELS else None

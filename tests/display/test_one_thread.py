@@ -1,0 +1,48 @@
+"""A long call from Python uses one thread, as a command does, and leaves the user's number as it was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import scipy.linalg  # noqa: F401  (its own OpenBLAS)
+
+from avtorch.display.progress import shows_progress
+from avtorch.threads import pools
+
+
+@shows_progress
+def work(fails: bool = False, *, progress: object = None) -> list[int]:
+    """Threads of all pools while it runs."""
+    if fails:
+        raise ValueError("no")
+    return counts()
+
+
+def counts() -> list[int]:
+    return [count() for count, _ in pools()]
+
+
+@pytest.fixture
+def two(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
+    """A user with two threads in each pool."""
+    before = [(put, count()) for count, put in pools()]
+    for put, _ in before:
+        put(2)
+    yield monkeypatch
+    for put, count in before:
+        put(count)
+
+
+def test_one_thread_within_and_as_before_behind(two: pytest.MonkeyPatch) -> None:
+    two.delenv("OMP_NUM_THREADS", raising=False)
+    assert len(pools()) >= 1
+    assert set(work()) == {1}
+    with pytest.raises(ValueError, match="no"):
+        work(fails=True)
+    assert set(counts()) == {2}
+
+
+def test_what_the_user_set_stays(two: pytest.MonkeyPatch) -> None:
+    two.setenv("OMP_NUM_THREADS", "2")
+    assert set(work()) == {2}
