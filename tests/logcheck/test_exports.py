@@ -163,6 +163,7 @@ EXPORTS: dict[str, Callable[[Car], Export]] = {
     "a command without a name": lambda c: Export(
         [("time", c.time), ("signal 17", c.command), ("speed", c.speed), ("accel", c.accel), ("signal 18", c.lateral)],
         {"accel_cmd": ("signal 17",), "accel": ("accel",), "speed": ("speed",)},
+        asked=("accel_cmd",),  # where the other one happens to go with the speed, too
     ),
     "pedals in per cent": lambda c: Export(
         [("Time", c.time), ("AccelPedalPos [%]", 100 * c.throttle), ("BrakePedalPos [%]", 100 * c.brake),

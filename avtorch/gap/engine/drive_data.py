@@ -23,7 +23,7 @@ from scipy.signal import lfilter
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.engine.compiled_plant import GRID_S
-from avtorch.gap.engine.priors import BAND_RATIO, CLAIM_HZ, FRAME_S, STANDSTILL_MPS, WARM_S
+from avtorch.gap.engine.priors import BAND_RATIO, CLAIM_HZ, FRAME_S, WARM_S
 from avtorch.io import Log
 from avtorch.io.log import AccelKind
 from avtorch.io.no_command import no_command
@@ -441,7 +441,7 @@ def _stretches(log: Log) -> list[slice]:
         moves = log.moving[part]
         if log.speed is not None:
             smooth = gaussian_filter1d(log.speed[part], _SMOOTH_S * log.rate_hz, mode="nearest")
-            moves = smooth > STANDSTILL_MPS
+            moves = smooth > log.standstill_mps
         change = np.flatnonzero(np.diff(moves.astype(int), prepend=0, append=0)).tolist()
         out += [slice(part.start + i, part.start + j) for i, j in zip(change[::2], change[1::2], strict=True)]
     return out

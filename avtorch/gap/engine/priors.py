@@ -64,8 +64,6 @@ SLOW_HZ = 2.0
 ONE_CHANNEL_HZ = 1.3
 """With one channel nothing above this frequency [Hz] tells the car's delays from the recorder's."""
 
-STANDSTILL_MPS = 0.3
-"""Speeds below are standstill [m/s], where GLVD does not hold."""
 WARM_S = 4.0
 """Start of each stretch that is simulated but not scored [s]: transients of lag and delay have died out."""
 FRAME_S = (4.0, 10.0)

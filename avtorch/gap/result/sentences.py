@@ -91,7 +91,8 @@ def _verdict(found: Findings) -> str:
         wrong = " and ".join(str(p) for p in found.tested.wrong)
         return f"The simulator lacks nothing that this log shows ({p}), but a parameter is wrong: {wrong}."
     if verdict.name == "none":
-        first = "The" if found.winner.probability >= SURE else "No effect stands out: probably the"
+        chance = found.winner.probability
+        first = "The" if chance >= SURE else f"No effect stands out: {'probably' if chance >= 0.5 else 'perhaps'} the"
         return f"{first} simulator lacks nothing that this log shows ({p}){but}."
     if found.budget is not None and (len(verdict.names) > 1 or verdict.partial):
         return str(found.budget)
