@@ -100,8 +100,10 @@ def examined(name: str, logs: list[Log]) -> Result:
     out.seconds = time.perf_counter() - begun
     out.verdict = found.verdict.names
     if found.budget is not None:
-        rest = found.budget.unexplained.share
-        out.unexplained, out.noise = (rest.q05, rest.q95), not found.budget.unexplained.material
+        rest = found.budget.unexplained
+        if rest.still is not None:
+            out.unexplained = rest.still.q05, rest.still.q95
+        out.noise = rest.rest(found.budget.material) == "noise"
     rate = logs[0].rate_hz
     thin = max(1, round(rate / SLOWEST_HZ))
     dt = thin / rate

@@ -49,6 +49,7 @@ class Scores:
 class HeldOut:
     """A chain of nested hypotheses on blocks that taught neither their parameters nor their noise.
 
+    `rival`: of the last hypothesis with that black box alone.
     `steps`: scores of each hypothesis of `chain`, then of the last one with the `free` form, if there is one; `floor`,
     `ceiling`: of the last and the first hypothesis with a black box on top (`black_box_rest`), the floor no higher than
     the last step. `values` (hypothesis, fold, parameter): as
@@ -60,6 +61,7 @@ class HeldOut:
     blocks: Blocks
     steps: tuple[Scores, ...]
     floor: Scores
+    rival: Scores
     ceiling: Scores
     values: FloatArray = field(repr=False)
     errors: FloatArray = field(repr=False)
@@ -118,15 +120,17 @@ def held_out_errors(chain: Sequence[Hypothesis], free: FittedForm | None = None)
         possible.append(found.possible)
         foretold.append(blocks.stitched(list(found.readings)))
         beside.append(_scores(data, blocks, errors - foretold[-1], x.residuals, x.residuals - found.coefficients))
+    floor = beside[0]
     if free is not None:
         scored.append(_with_form(free, blocks))
-        beside[0] = _lower(beside[0], scored[-1])
+        floor = _lower(floor, scored[-1])
     longest = max(rows.stop - rows.start for rows in blocks.rows) * data.dt
     return HeldOut(
         chain=tuple(chain),
         blocks=blocks,
         steps=tuple(scored),
-        floor=beside[0],
+        floor=floor,
+        rival=beside[0],
         ceiling=beside[1],
         values=np.stack([x.values for x in fitted]),
         errors=np.stack(compared(data, stitched[-1])),

@@ -168,6 +168,7 @@ def budget(found: Findings) -> list[str]:
     told = found.budget.names == found.verdict.names and not found.verdict.partial
     line = [found.budget.beside_its_name() if told else str(found.budget)]
     line = [] if headline(found).endswith(str(found.budget)) else line
+    rest = found.budget.unexplained.rest(found.budget.material)
     errors, floors = [], []
     for name, error in found.budget.by_channel.items():
         errors.append(f"in {_WORD[name]} from {error.before:.2g} to {error.left:.2g} {_UNIT[name]}")
@@ -175,7 +176,8 @@ def budget(found: Findings) -> list[str]:
     return [
         *line,
         f"In simulations of {found.budget.horizon_s:.3g} s from the logged commands, on parts of the drive not used "
-        f"for fitting, {cut} the error {' and '.join(errors)}; noise alone makes {' and '.join(floors)}.",
+        f"for fitting, {cut} the error {' and '.join(errors)}"
+        + (f"; noise alone makes {' and '.join(floors)}." if rest == "noise" else "."),
     ]
 
 
