@@ -108,6 +108,9 @@ def diagnose(
     material: Annotated[float, Parameter(help="Share of the gap from which something counts, between 0 and 1.")] = 0.03,
     effects: Annotated[str | None, Parameter(help="Only these effects, NAME,NAME,...; default: all.")] = None,
     pairs: Annotated[bool, Parameter(help="Look for several effects at once.")] = True,
+    named_only: Annotated[
+        bool, Parameter(negative=(), help="The repaired simulator has named effects alone, no map without a name.")
+    ] = False,
     posterior: Annotated[
         Literal["laplace", "sgld"],
         Parameter(help="Posterior of the winner's parameters: normal approximation, or SGLD."),
@@ -184,9 +187,19 @@ def diagnose(
 
     talk = Talk(json=json, quiet=quiet)
     if follower:
-        usual = {"accel_kind": accel_kind == "kinematic", "no_pairs": pairs, "posterior": posterior == "sgld"}
+        usual = {
+            "accel_kind": accel_kind == "kinematic",
+            "no_pairs": pairs,
+            "named_only": not named_only,
+            "posterior": posterior == "sgld",
+        }
         idle = {"simulated": simulated, "simulator": simulator, "step": step is not None, "adjust": adjust}
-        idle |= {"estimates": estimates, "rollouts": rollouts is not None, "processes": processes != 1}
+        idle |= {
+            "named_only": named_only,
+            "estimates": estimates,
+            "rollouts": rollouts is not None,
+            "processes": processes != 1,
+        }
         idle |= {"baseline": assumed, "prior": weights, "budget": budget is not None}
         idle |= {option: not default for option, default in usual.items()}
         refuse(logs, **idle, **{option: value is not None for option, value in track.items()})
@@ -235,6 +248,7 @@ def diagnose(
         material=material,
         effects=chosen,
         pairs=pairs,
+        named_only=named_only,
         posterior=posterior,
         seed=seed,
     )
@@ -251,6 +265,7 @@ def diagnose(
             posterior=posterior,
             budget_s=budget,
             material=material,
+            named_only=named_only,
             seed=seed,
             progress=done,
         )

@@ -41,6 +41,7 @@ from avtorch.gap.effects import (
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.effect import EFFECTS, PLACES, Effect, NoiseChange, effect_class, register
 from avtorch.gap.simulator.effect_context import EffectContext
+from avtorch.gap.simulator.force_table import FREE_FORMS, ForceTable, ResistanceCurve
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.plant import BASELINE, GapPlant, plant
 from avtorch.gap.simulator.recursion import scan, scan_pair
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
 __all__ = [
     "BASELINE",
     "EFFECTS",
+    "FREE_FORMS",
     "PLACES",
     "AerodynamicDrag",
     "Backlash",
@@ -67,6 +69,7 @@ __all__ = [
     "DrivelineOscillation",
     "Effect",
     "EffectContext",
+    "ForceTable",
     "GainChange",
     "GapPlant",
     "GearShift",
@@ -77,6 +80,7 @@ __all__ = [
     "Parameter",
     "Part",
     "RateLimit",
+    "ResistanceCurve",
     "Response",
     "RoadGrade",
     "Saturation",

@@ -2,6 +2,8 @@
 
 - Autoware's planning simulator (`simple_planning_simulator`, model `DELAY_STEER_ACC_GEARED_WO_FALL_GUARD` and its
   kin): `acc_time_delay` [s], `acc_time_constant` [s], `vel_rate_lim` [m/s²], `acc_scaling_factor` of the debug model
+- where the plant has a free form, `acceleration_map_path` of its model `DELAY_STEER_MAP_ACC_GEARED`: a table of the
+  acceleration that follows a command (rows) at a speed (columns)
 - openpilot (`CarParams`): `longitudinalActuatorDelay` [s], from command to response, lag and all
 - SUMO's `vType` (`sumo.py`) and the pedals of CARLA (`carla.py`)
 """
@@ -12,21 +14,26 @@ import math
 from os import PathLike
 from pathlib import Path
 
-from avtorch.gap import GapPlant
+import torch
+
+from avtorch.gap import FREE_FORMS, ForceTable, GapPlant, ResistanceCurve
 from avtorch.io import answer_set, atomic
 from avtorch.pedals import PedalMap
 from avtorch.remedy.carla import to_carla
 from avtorch.remedy.exported import Exported, delay_of, delays_of, gain_lost, not_exported
 from avtorch.remedy.sumo import to_sumo
 
-FILES = ("plant.autoware.yaml", "plant.openpilot.yaml", "plant.sumo.xml", "plant.carla.yaml")
+ACCELERATION_MAP = "plant.autoware.csv"
+FILES = ("plant.autoware.yaml", "plant.openpilot.yaml", "plant.sumo.xml", "plant.carla.yaml", ACCELERATION_MAP)
 """Every file of an export.
 
 Example:
     >>> from avtorch.remedy.exports import FILES
     >>> [name.split(".")[1] for name in FILES]
-    ['autoware', 'openpilot', 'sumo', 'carla']
+    ['autoware', 'openpilot', 'sumo', 'carla', 'autoware']
 """
+
+_FAR_MPS2 = 10.0  # beyond what tyres hold
 
 
 def to_autoware(plant: GapPlant) -> Exported:
@@ -53,7 +60,40 @@ def to_autoware(plant: GapPlant) -> Exported:
     lost = [f"{name}: limits that differ for driving and braking; the tool's one is the wider" for name in limiting]
     lost += [f"{e.name}: {e.export_loss}" for e in plant.effects if e.export_loss]
     partly = [*limiting, *delays_of(plant), *(e.name for e in plant.effects if e.export_loss)]
-    return Exported("Autoware planning simulator", values, (*lost, *not_exported(plant, partly)))
+    tool = "Autoware planning simulator"
+    if acceleration_map(plant) is not None:
+        tool += f", vehicle_model_type DELAY_STEER_MAP_ACC_GEARED with acceleration_map_path {ACCELERATION_MAP}"
+        values["debug_acc_scaling_factor"] = 1.0  # the gain is in the map
+        partly += [kind.name for kind in FREE_FORMS]
+    return Exported(tool, values, (*lost, *not_exported(plant, partly)))
+
+
+def acceleration_map(plant: GapPlant) -> str | None:
+    """The plant's free form as Autoware's table: accelerations [m/s²] that follow commands (rows) [m/s²] at speeds
+    (columns) [m/s], the gain and the resistance among them; None where it has none.
+
+    Example:
+        >>> from avtorch.gap import ForceTable, plant
+        >>> from avtorch.remedy.exports import acceleration_map
+        >>> print(acceleration_map(plant([ForceTable((0.0, 2.0), (0.0, 30.0), ((0.0, 0.0), (0.0, -1.0)))])), end="")
+        default,0,30
+        0,0,0
+        2,2,1
+    """
+    tables = [e for e in plant.effects if isinstance(e, ForceTable)]
+    curves = [e for e in plant.effects if isinstance(e, ResistanceCurve)]
+    if not tables and not curves:
+        return None
+    speeds = tables[0].speed_mps if tables else curves[0].speed_mps
+    commands = tables[0].command_mps2 if tables else (-_FAR_MPS2, _FAR_MPS2)
+    lines = [",".join(["default", *(f"{v:.6g}" for v in speeds)])]
+    at = torch.tensor(speeds, dtype=torch.float64)
+    resists = sum((c.force(at) for c in curves), torch.zeros_like(at))
+    for u in commands:
+        given = torch.full_like(at, u)
+        force = plant.K_L * given + resists + sum((t.force(given, at) for t in tables), torch.zeros_like(at))
+        lines.append(",".join(f"{x:.6g}" for x in (u, *force.tolist())))
+    return "\n".join(lines) + "\n"
 
 
 def to_openpilot(plant: GapPlant) -> Exported:
@@ -86,10 +126,12 @@ def write_exports(plant: GapPlant | None, folder: str | PathLike[str], *, pedals
         ['plant.autoware.yaml', 'plant.openpilot.yaml', 'plant.sumo.xml']
     """
     made = [None] * 3 if plant is None else [to_autoware(plant), to_openpilot(plant), to_sumo(plant)]
-    exports = dict(zip(FILES, [*made, None if pedals is None else to_carla(pedals, plant)], strict=True))
-    there = {name: exported for name, exported in exports.items() if exported is not None}
+    exports = [*made, None if pedals is None else to_carla(pedals, plant)]
+    texts = [None if x is None else x.to_text() for x in exports]
+    texts.append(None if plant is None else acceleration_map(plant))
+    there = {name: text for name, text in zip(FILES, texts, strict=True) if text is not None}
     with answer_set(folder, FILES) as staged:
-        for name, exported in there.items():
+        for name, text in there.items():
             with atomic(staged / name) as stream:
-                stream.write(exported.to_text())
+                stream.write(text)
     return [Path(folder) / name for name in there]

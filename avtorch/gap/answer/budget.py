@@ -111,7 +111,8 @@ class Unexplained:
 
     `material`: surely more than a user cares for; `probability`: that it is more. Where it is material, `where` holds
     the parts of the drive that it lies in, if any in particular, and `resembles` the effect that promises to explain
-    much of it but is not certain enough to be named.
+    much of it but is not certain enough to be named. `still`: the share of the squared error left that a black box
+    takes off on blocks that taught neither, from what it surely does to what the log could have shown.
 
     Example:
         >>> from avtorch.gap import Unexplained
@@ -125,6 +126,14 @@ class Unexplained:
     probability: float = 0.0
     where: tuple[Location, ...] = ()
     resembles: str | None = None
+    still: Quantity | None = None
+
+    def rest(self, material: float) -> str:
+        """What the error that is left is, in words: noise only where no black box could take off what matters."""
+        if self.still is None or self.still.q95 < material:
+            return "noise"
+        low, high = (round(100 * x) for x in (self.still.q05, self.still.q95))
+        return f"noise but for {low} to {high} %, which a black box may still foretell"
 
     def places(self, epoch_s: float = 0.0) -> str:
         """Where it lies and what it resembles, in words; empty where nothing was found. Times count from `epoch_s`."""
@@ -139,6 +148,7 @@ class Unexplained:
             "probability": self.probability,
             "where": [part.to_dict() for part in self.where],
             "resembles": self.resembles,
+            "still": None if self.still is None else _interval(self.still),
         }
 
 
@@ -225,8 +235,14 @@ class Budget:
     def __str__(self) -> str:
         """What a person reads first."""
         if not self.names:
-            found = "No known effect explains the gap." if self.unexplained.material else "Nothing material is missing."
-            return found
+            if self.unexplained.material:
+                return "No known effect explains the gap."
+            rest = self.unexplained.rest(self.material)
+            return (
+                "Nothing material is missing."
+                if rest == "noise"
+                else f"No known effect is missing; the error is {rest}."
+            )
         return self._sentence(lead="")
 
     def beside_its_name(self) -> str:
@@ -246,7 +262,8 @@ class Budget:
         if self.unexplained.share.mean >= 0.005 and named:
             lines.append(f"{percent(self.unexplained.share.mean)} is reproducible and no known effect explains it")
         by_chance = [_words(c) for c in self.chance if c.probability >= LIKELY]
-        noise = "noise" if not by_chance else f"noise, in part this: {' and '.join(by_chance)}"
+        noise = self.unexplained.rest(self.material)
+        noise = noise if not by_chance else f"{noise}, in part this: {' and '.join(by_chance)}"
         lines.append(f"the rest of the error is {noise}")
         text = "; ".join(lines) + "."
         return text[0].upper() + text[1:]

@@ -32,6 +32,7 @@ from avtorch.gap.engine.force_map import ForceMap
 from avtorch.gap.quantity import Quantity, frame_of, unit_of
 from avtorch.gap.result import sentences
 from avtorch.gap.result.alarm import Alarm
+from avtorch.gap.result.free_form import FreeForm
 from avtorch.gap.result.gap_size import GapSize
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.parts import AnswerPart, force_map_of
@@ -67,6 +68,7 @@ DIAGNOSIS_FILES = (
     "diagnosis.json",
     "plant.toml",
     "plant.autoware.yaml",
+    "plant.autoware.csv",
     "plant.openpilot.yaml",
     "plant.sumo.xml",
     "plant.carla.yaml",
@@ -82,7 +84,7 @@ class Diagnosis(Displayed):
 
     - `candidates`: the hypotheses as `listed_candidates` orders them, whatever the order given
     - `simulator`: the user's own, with `T_L` and `K_L` fitted without any effect; `plant`: the same with the verdict's
-      effects, at the posterior mean, None where nothing was named
+      effects, at the posterior mean, and a `free_form` where that foretells more; None where there is neither
     - `assumed`: draws (draw,) of the simulator's `T_L` [s] and `K_L`; `belief`: draws (draw,) of the parameters of
       `plant`, or of `simulator` where there is none, by its own names; `draws`: posterior of the winner's parameters
       (chain, draw) by the table's names
@@ -144,6 +146,7 @@ class Diagnosis(Displayed):
     tested: SimulatorUnderTest | None = None
     alarms: tuple[Alarm, ...] = ()
     parts: tuple[AnswerPart, ...] = ()
+    free_form: FreeForm | None = None
 
     def __post_init__(self) -> None:
         if self.onset_s is not None and self.onset_from_start_s is None:
@@ -211,7 +214,7 @@ class Diagnosis(Displayed):
 
     @property
     def force_map(self) -> ForceMap | None:
-        """The car's force beyond K u where it is likely, as a table; `plant` does not carry it."""
+        """The car's force beyond K u where the evidence has it likely; `free_form` is what `plant` carries."""
         return force_map_of(self.parts)
 
     @property

@@ -101,7 +101,9 @@ def budget_of(
         left=float(np.sqrt(energy[-1].mean() / bottom)),
         by_channel=by_channel,
         parts=tuple(parts),
-        unexplained=Unexplained(unnamed, matters, average.probabilities["unknown"] if not parts else beyond),
+        unexplained=Unexplained(
+            unnamed, matters, average.probabilities["unknown"] if not parts else beyond, still=_still(held, seed)
+        ),
         baseline={key: held.chain[0][key] for key in ("T_L", "K_L")},
         repaired=posterior.moved(),
         chance=_chance(average, posterior, names, tuple(dict.fromkeys((*CHANCE, *chance)))),
@@ -181,6 +183,28 @@ def _resampled(energy: FloatArray, floor: FloatArray, seed: int) -> FloatArray:
     alike = np.full_like(parts, 1.0 / max(parts.shape[1] - 1, 1))  # where runs show no gap, shares say nothing
     alike[:, -1] = 0.0 if parts.shape[1] > 1 else 1.0
     return np.where(total > _NOTHING * levels[:, :1], parts / np.maximum(total, 1e-300), alike)
+
+
+def _still(held: HeldOut, seed: int) -> Quantity:
+    """Share of the squared error of the repaired simulator, in the last channel, that a black box still takes off.
+
+    The lower end is what it did on blocks that taught neither, the upper end also what these blocks would have let pass
+    unseen (`HeldOut.possible`), both under resampled blocks.
+    """
+    plant, box = held.steps[-1].squares[-1], held.rival.squares[-1]
+    named = held.steps[len(held.chain) - 1].squares[-1]
+    possible = held.possible[:, -1]
+    blocks = len(plant)
+    rng = np.random.default_rng(seed)
+    pick = rng.integers(0, blocks, (_RESAMPLES, blocks))
+    pick[0] = np.arange(blocks)
+    total = np.maximum(plant[pick].sum(1), 1e-12)
+    did = np.clip((plant - box)[pick].sum(1) / total, 0.0, 1.0)
+    drawn = np.take_along_axis(possible[rng.integers(0, len(possible), _RESAMPLES)], pick, 1).sum(1)
+    could = np.clip((drawn - np.maximum((named - plant)[pick].sum(1), 0.0)) / total, 0.0, 1.0)
+    low, high = float(np.quantile(did, 0.05)), float(np.quantile(np.maximum(did, could), 0.95))
+    mean = float(did[0])
+    return Quantity(mean, float(did.std()), min(low, mean), max(high, mean))
 
 
 def _quantity(draws: FloatArray) -> Quantity:

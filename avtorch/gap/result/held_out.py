@@ -28,6 +28,7 @@ from avtorch.gap.engine.gauss_newton import fit, linear_priors, linearised, pena
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance, whiten
 from avtorch.gap.result.black_box_rest import BlackBox
+from avtorch.gap.result.free_form import FittedForm
 from avtorch.gap.result.free_runs import Blocks, compared, measured_readings, readings
 
 _STEPS = 3  # of a fold's fit
@@ -48,8 +49,10 @@ class Scores:
 class HeldOut:
     """A chain of nested hypotheses on blocks that taught neither their parameters nor their noise.
 
-    `steps`: scores of each hypothesis of `chain`; `floor`, `ceiling`: of the last and the first with a black box on top
-    (`black_box_rest`), the floor that of a force map where that is lower. `values` (hypothesis, fold, parameter): as
+    `rival`: of the last hypothesis with that black box alone.
+    `steps`: scores of each hypothesis of `chain`, then of the last one with the `free` form, if there is one; `floor`,
+    `ceiling`: of the last and the first hypothesis with a black box on top (`black_box_rest`), the floor no higher than
+    the last step. `values` (hypothesis, fold, parameter): as
     each fold's other blocks teach them. `errors`, `predicted` (channel, row) [m/s²]: of acceleration and differenced
     speed, what the last hypothesis leaves and what the black box foretells of it. `horizon_s` of the free runs.
     """
@@ -58,12 +61,14 @@ class HeldOut:
     blocks: Blocks
     steps: tuple[Scores, ...]
     floor: Scores
+    rival: Scores
     ceiling: Scores
     values: FloatArray = field(repr=False)
     errors: FloatArray = field(repr=False)
     predicted: FloatArray = field(repr=False)
     possible: FloatArray = field(repr=False)
     horizon_s: float
+    free: bool = False
 
     @property
     def data(self) -> DriveData:
@@ -71,8 +76,8 @@ class HeldOut:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The effects by the table's names, in the order in which they enter."""
-        return tuple(entered(a, b) for a, b in pairwise(self.chain))
+        """The effects by the table's names, in the order in which they enter; the free form, without a name, last."""
+        return (*(entered(a, b) for a, b in pairwise(self.chain)), *(["free form"] if self.free else []))
 
     @property
     def frame_rows(self) -> FloatArray:
@@ -81,10 +86,10 @@ class HeldOut:
         return np.asarray(frames * float(self.data.frame_rows), np.float64)
 
 
-def held_out_errors(chain: Sequence[Hypothesis], mapped: Hypothesis | None = None) -> HeldOut | None:
+def held_out_errors(chain: Sequence[Hypothesis], free: FittedForm | None = None) -> HeldOut | None:
     """The scores of nested hypotheses, fitted to all blocks, the base first (`nested`).
 
-    `mapped`: the last with a force map, which the repaired simulator does not carry: what it leaves is a floor, too.
+    `free`: a form beside the last, which the repaired simulator carries: what it leaves is the last step.
 
     None where the drives are too short for `FEWEST` blocks.
 
@@ -115,18 +120,24 @@ def held_out_errors(chain: Sequence[Hypothesis], mapped: Hypothesis | None = Non
         possible.append(found.possible)
         foretold.append(blocks.stitched(list(found.readings)))
         beside.append(_scores(data, blocks, errors - foretold[-1], x.residuals, x.residuals - found.coefficients))
+    floor = beside[0]
+    if free is not None:
+        scored.append(_with_form(free, blocks))
+        floor = _lower(floor, scored[-1])
     longest = max(rows.stop - rows.start for rows in blocks.rows) * data.dt
     return HeldOut(
         chain=tuple(chain),
         blocks=blocks,
         steps=tuple(scored),
-        floor=beside[0] if mapped is None else _lower(beside[0], _alone(_taught(mapped, blocks), blocks)),
+        floor=floor,
+        rival=beside[0],
         ceiling=beside[1],
         values=np.stack([x.values for x in fitted]),
         errors=np.stack(compared(data, stitched[-1])),
         predicted=np.stack(compared(data, foretold[0])),
         possible=possible[0],
         horizon_s=min(HORIZON_S, longest),
+        free=free is not None,
     )
 
 
@@ -235,9 +246,20 @@ def _refitted(h: Hypothesis, without: str) -> Hypothesis:
     return fit(rest, 6, 0.1)
 
 
-def _alone(x: _Taught, blocks: Blocks) -> Scores:
-    """Of a hypothesis by itself."""
-    return _scores(x.hypothesis.data, blocks, blocks.stitched(list(x.errors)), x.residuals, x.residuals)
+def _with_form(free: FittedForm, blocks: Blocks) -> Scores:
+    """Of a hypothesis with its free form, which each fold's other blocks teach."""
+    h = free.lagged
+    accel, gained = h.on_grid()
+    grid = h.data.grid
+    step = np.where(grid.starts, 0.0, np.diff(grid.time, prepend=grid.time[:1]))
+    errors, residuals = [], []
+    for k in range(len(blocks.taught)):
+        adds = free.without([rows for rows, fold in zip(blocks.rows, blocks.fold, strict=True) if fold == k])
+        more = np.cumsum(step * np.concatenate([adds[:1], adds[:-1]]))
+        rows = readings(h, accel + adds, gained + more)
+        errors.append(measured_readings(h.data) - rows)
+        residuals.append(h.data.measured - h.data.transform(compared(h.data, rows)))
+    return _scores(h.data, blocks, blocks.stitched(errors), np.array(residuals), np.array(residuals))
 
 
 def _lower(a: Scores, b: Scores) -> Scores:

@@ -11,6 +11,7 @@ from avtorch.gap.answer.scope import Scope
 from avtorch.gap.answer.shrinkage import Shrinkage
 from avtorch.gap.answer.verdict import Candidate, Verdict, meanings
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.free_form import FreeForm
 from avtorch.gap.result.gap_size import GapSize
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
@@ -66,6 +67,8 @@ class Findings(Protocol):
     def scope(self) -> Scope | None: ...
     @property
     def tested(self) -> SimulatorUnderTest | None: ...
+    @property
+    def free_form(self) -> FreeForm | None: ...
 
 
 def headline(found: Findings) -> str:
@@ -161,9 +164,12 @@ def budget(found: Findings) -> list[str]:
         return []
     verb = "cut" if all(e.left < e.before for e in found.budget.by_channel.values()) else "take"
     cut = f"this effect {verb}s" if len(found.budget.names) == 1 else f"these effects {verb}"
+    if found.free_form is not None:
+        cut = f"the repaired simulator {verb}s"
     told = found.budget.names == found.verdict.names and not found.verdict.partial
     line = [found.budget.beside_its_name() if told else str(found.budget)]
     line = [] if headline(found).endswith(str(found.budget)) else line
+    rest = found.budget.unexplained.rest(found.budget.material)
     errors, floors = [], []
     for name, error in found.budget.by_channel.items():
         errors.append(f"in {_WORD[name]} from {error.before:.2g} to {error.left:.2g} {_UNIT[name]}")
@@ -171,7 +177,8 @@ def budget(found: Findings) -> list[str]:
     return [
         *line,
         f"In simulations of {found.budget.horizon_s:.3g} s from the logged commands, on parts of the drive not used "
-        f"for fitting, {cut} the error {' and '.join(errors)}; noise alone makes {' and '.join(floors)}.",
+        f"for fitting, {cut} the error {' and '.join(errors)}"
+        + (f"; noise alone makes {' and '.join(floors)}." if rest == "noise" else "."),
     ]
 
 

@@ -32,7 +32,8 @@ def substeps(effects: Iterable[Effect], u: Tensor, row: EffectContext, hook: Hoo
         out = hook(e, late)
         if isinstance(out, tuple):
             early, late, first = out
-        else:
+        else:  # what follows a delay has no memory
+            early = None if early is None else hook(e, early)
             late = out
     pieces = [(late, row.dt)]
     if early is not None and first is not None:

@@ -15,6 +15,7 @@ from torch import Tensor
 from avtorch.errors import InputError, quoted
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.effect import Effect, effect_class
+from avtorch.gap.simulator.force_table import FREE_FORMS
 from avtorch.io.opening import place
 from avtorch.io.toml import parse_toml, read_toml
 from avtorch.numeral import numeral
@@ -128,6 +129,7 @@ def _number(name: str, value: Any) -> str:
 def _of(tables: Mapping[str, Any], more: Iterable[type[Effect]]) -> PlantDescription:
     baseline: dict[str, float] = {}
     effects = []
+    more = (*FREE_FORMS, *more)
     for name, value in tables.items():
         if name in _DOMAINS:
             baseline[name] = _DOMAINS[name].value(name, value)

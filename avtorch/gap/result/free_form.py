@@ -1,0 +1,497 @@
+r"""The free form of a repaired simulator: what the car's force does beyond K u, fitted to free runs.
+
+    F ~ N(0, (z_F A)^2 [k(u) + k(u) k(v) / 2]),    R ~ N(0, (z_R A)^2 [1 + v v' + k(v)])
+
+at the knots of command and speed, k the Matern-3/2 kernel of length one standard deviation of what was driven, A the
+standard deviation of the acceleration (Rasmussen and Williams 2006, 2 and 4.2). Where nothing was driven the table goes
+back to K u, and the resistance to a line. With given sizes z the coefficients minimise
+
+    n ln(mean squared error of the speed in free runs) + b' C^-1 b,    n = taught seconds / `INDEPENDENT_S`
+
+by Levenberg and Marquardt; the car's lag has the evidence's posterior as its prior. Sizes are those that do best on
+blocks left out in two ways, dealt evenly and by likeness, of which the worse counts: laps repeat, and what was taught
+nearby proves little (Roberts et al. 2017). A run is nearly linear in b, so blocks left out cost one Gram matrix.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.signal import lfilter
+
+from avtorch.arrays import BoolArray, FloatArray, IntArray
+from avtorch.gap.engine.car import plant_of
+from avtorch.gap.engine.force_map import ForceMap
+from avtorch.gap.engine.gauss_newton import fit
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.priors import MAP_SIZE
+from avtorch.gap.engine.sample import sample
+from avtorch.gap.result.output_error import STEP_S, Coefficients, Runs
+from avtorch.gap.simulator.effect_context import EffectContext
+from avtorch.gap.simulator.force_table import ForceTable, ResistanceCurve
+from avtorch.gap.simulator.order import at_place
+from avtorch.gap.simulator.plant import GapPlant, plant
+
+INDEPENDENT_S = 2.0
+"""Taught seconds that count as one independent error [s]: what is left of a free run wanders over a second or two."""
+FORM_NATS = 1.0
+"""What a free form costs by its presence [nats]."""
+NO_RESISTANCE_NATS = 3.0
+"""What a table without a resistance costs [nats]: where the command is a force, the car has a resistance."""
+GAIN_SD = 1.0
+"""Standard deviation of the gain beside a free form, about the evidence's [-]: a nominal command's unit is open."""
+SIZES = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
+"""Relative sizes z that are tried [-]."""
+_U_QUANTILES = (0.005, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 0.995)
+_V_QUANTILES = (0.002, 0.08, 0.25, 0.5, 0.75, 0.92, 0.998)
+_APART = 0.12  # standard deviations between knots, least
+_BLOCK_S = (4.0, 10.0)  # shortest and longest block
+_BLOCKS = 10  # aimed at in short drives
+_FOLDS = 10
+_ROUNDS = 10  # of a fit
+_DIGITS = 5  # of knots and forces behind the point
+_SLACK = 1e-3  # of a covariance's diagonal
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Relative prior sizes [-] of the resistance and of the table; 0: there is none."""
+
+    resistance: float
+    table: float
+
+    @property
+    def any(self) -> bool:
+        """Whether there is a free form at all."""
+        return self.resistance > 0 or self.table > 0
+
+    @property
+    def nats(self) -> float:
+        """What they cost: presence, and the log-normal prior of sizes."""
+        middle, spread = MAP_SIZE
+        on = [z for z in (self.resistance, self.table) if z > 0]
+        alone = NO_RESISTANCE_NATS if self.table > 0 and not self.resistance > 0 else 0.0
+        return alone + sum(FORM_NATS + 0.5 * (np.log(z / middle) / spread) ** 2 for z in on)
+
+
+_STARTS = (Sizes(0.1, 0.0), Sizes(0.3, 0.3))
+_DESCENTS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class FreeForm:
+    """Coefficients at `knots_u` (u,) [m/s²] and `knots_v` (v,) [m/s] beside a named car of lag `T_L` [s]."""
+
+    knots_u: FloatArray
+    knots_v: FloatArray
+    at: Coefficients
+    sizes: Sizes
+    T_L: float
+
+    def effects(self) -> list[ForceTable | ResistanceCurve]:
+        """As effects of a plant."""
+        u, v, curve = (tuple(x.round(_DIGITS).tolist()) for x in (self.knots_u, self.knots_v, self.at.curve))
+        out: list[ForceTable | ResistanceCurve] = []
+        if self.sizes.table > 0:
+            out.append(ForceTable(u, v, tuple(tuple(row) for row in self.at.table.round(_DIGITS).tolist())))
+        if self.sizes.resistance > 0:
+            out.append(ResistanceCurve(v, curve))
+        return out
+
+    def beside(self, car: GapPlant) -> GapPlant:
+        """The car with the free form, without the gust of which it takes a part: what is left of that is not known."""
+        kept = [e for e in car.effects if "force_sd" not in e.noise_parameters.values()]
+        return plant([*kept, *self.effects()], T_L=self.T_L, K_L=float(car.K_L) + self.at.gain, sigma=float(car.sigma))
+
+
+# the car's runs -------------------------------------------------------------------------------------------------------
+class _Car:
+    """A hypothesis without a force map and its runs at any lag. `lag`: mean and standard deviation of ln T_L."""
+
+    def __init__(self, h: Hypothesis, baseline: GapPlant | None, lag: tuple[float, float]) -> None:
+        self.h, self.lag = h, lag
+        self.car = plant_of(h, baseline)
+        data = h.data
+        assert data.speed is not None
+        self.every = max(1, round(STEP_S / data.dt))
+        self.dt = self.every * data.dt
+        rows = [np.arange(i, j, self.every) for i, j in itertools.pairwise(data.bounds) if (j - i) // self.every > 2]
+        self.source = np.concatenate(rows)
+        self.starts = np.concatenate([np.arange(len(r)) == 0 for r in rows])
+        self.command = self._arriving()
+        self.speed = data.smooth_speed[self.source]
+        self.knots_u = _knots(self.command, _U_QUANTILES, zero=True)
+        self.knots_v = _knots(self.speed, _V_QUANTILES)
+        self.zero = np.append(np.zeros(len(self.knots_u) * len(self.knots_v) + len(self.knots_v) + 1), lag[0])
+        self._known: dict[tuple[float, bool], Runs] = {}
+
+    def runs(self, log_lag: float, *, cut: bool = False) -> Runs:
+        """The free runs of the car with that ln T_L; `cut`: none goes beyond its block."""
+        if (log_lag, cut) not in self._known:
+            h = self.h.copy()
+            h["T_L"] = float(np.exp(log_lag))
+            gained = h.on_grid()[1]
+            at = np.interp(h.data.time[self.source], h.data.grid.time, gained)
+            after = np.interp(h.data.time[self.source] + self.dt, h.data.grid.time, gained)
+            last = np.append(self.starts[1:], True)
+            after[last] = at[last]  # of no run
+            self._known[log_lag, cut] = Runs.of(
+                self.dt,
+                self.command,
+                self.speed,
+                (after - at) / self.dt,
+                self.source,
+                self.starts,
+                self.knots_u,
+                self.knots_v,
+                self.edges if cut else None,
+            )
+        return self._known[log_lag, cut]
+
+    @cached_property
+    def edges(self) -> IntArray:
+        """First rows of blocks of about `_BLOCK_S`, and the end of the last one (block + 1,)."""
+        rows = np.append(np.flatnonzero(self.starts), len(self.speed)).tolist()
+        length = float(np.clip(len(self.speed) * self.dt / _BLOCKS, *_BLOCK_S))
+        out = [0]
+        for i, j in itertools.pairwise(rows):
+            out += np.linspace(i, j, max(1, round((j - i) * self.dt / length)) + 1).astype(int)[1:].tolist()
+        return np.array(out)
+
+    def _arriving(self) -> FloatArray:
+        """Commands (row,) behind the effects upstream of the actuator, as means over the steps."""
+        data, out = self.h.data, np.empty(len(self.source))
+        effects = [e for e in at_place(self.car.effects, "command") if not e.random]
+        late = sum(float(e.values()[e.shift]) for e in effects if e.shift is not None)
+        row_of = np.searchsorted(self.source, data.bounds)
+        for (i, j), (a, b) in zip(itertools.pairwise(data.bounds), itertools.pairwise(row_of), strict=True):
+            if a == b:
+                continue
+            u, t = data.command[i:j], data.time[i:j]
+            speed, dt = torch.as_tensor(data.smooth_speed[i:j]), torch.tensor(data.dt)
+            row = EffectContext(
+                torch.as_tensor(t), dt, speed, None, torch.as_tensor(self.car.T_L), torch.as_tensor(self.car.K_L)
+            )
+            for e in effects:
+                if e.shift is None:
+                    u = e.over(torch.as_tensor(u), row).numpy()
+            whole = np.append(0.0, np.cumsum(u * data.dt))
+            ends = np.append(t, t[-1] + data.dt)
+            begins = data.time[self.source[a:b]] - late
+
+            since, until = (
+                np.interp(x, ends, whole) + np.minimum(x - ends[0], 0.0) * u[0]
+                for x in (begins, np.minimum(begins + self.dt, ends[-1]))
+            )
+            out[a:b] = (until - since) / self.dt
+        return out
+
+
+def _knots(x: FloatArray, quantiles: Sequence[float], *, zero: bool = False) -> FloatArray:
+    """Knots (knot,) at quantiles of `x`, two at least, and at 0 where the command changes sign."""
+    at = np.quantile(x, quantiles)
+    if zero and at[0] < 0 < at[-1]:
+        at = np.sort(np.append(at, 0.0))
+    least = max(_APART * float(x.std()), 1e-3)
+    kept = [float(at[0])]
+    for value in at[1:].tolist():
+        if value - kept[-1] > least:
+            kept.append(value)
+    return np.array(kept if len(kept) > 1 else [kept[0], kept[0] + 10 * least])
+
+
+def _matern(x: FloatArray) -> FloatArray:
+    far = np.sqrt(3.0) * np.abs(x[:, None] - x)
+    return (1.0 + far) * np.exp(-far)
+
+
+# the fit --------------------------------------------------------------------------------------------------------------
+class _Prior:
+    """Precision of the coefficients that move at given sizes: those of table and curve, the gain, and ln T_L."""
+
+    def __init__(self, car: _Car, sizes: Sizes) -> None:
+        u, v = car.command, car.speed
+        along_u = _matern(car.knots_u / max(float(u.std()), 1e-9))
+        z = (car.knots_v - v.mean()) / max(float(v.std()), 1e-9)
+        along_v = _matern(z)
+        scale = max(float(np.diff(v)[~car.starts[1:]].std()) / car.dt, 1e-3)
+        table = np.kron(along_u, np.ones_like(along_v)) + 0.5 * np.kron(along_u, along_v)
+        curve = 1.0 + np.outer(z, z) + along_v
+        blocks, moves = [], []
+        for covariance, size in ((table, sizes.table), (curve, sizes.resistance)):
+            moves += [size > 0] * len(covariance)
+            if size > 0:
+                blocks.append(np.linalg.inv(covariance + _SLACK * np.eye(len(covariance))) / (size * scale) ** 2)
+        blocks += [np.array([[GAIN_SD**-2]]), np.array([[car.lag[1] ** -2]])]
+        self.moves = np.array([*moves, True, True])
+        n = sum(len(b) for b in blocks)
+        self.precision, at = np.zeros((n, n)), 0
+        for b in blocks:
+            self.precision[at : at + len(b), at : at + len(b)] = b
+            at += len(b)
+        self.mean = np.zeros(len(self.moves))
+        self.mean[-1] = car.lag[0]
+
+    def of(self, x: FloatArray) -> float:
+        d = (x - self.mean)[self.moves]
+        return float(d @ self.precision @ d)
+
+
+_DRAWS = 400  # of the evidence's lag
+_LEAST_LAG_SD = 0.02  # of its logarithm
+_LAG_STEP = 0.05  # of ln T_L, for its slope
+
+
+class _Fit:
+    """Coefficients `x` (table, curve, gain, ln T_L) with the errors (error,) and slopes (error, coefficient) there."""
+
+    def __init__(self, car: _Car, x: FloatArray, *, cut: bool = False) -> None:
+        self.car, self.x = car, x
+        self.runs = car.runs(float(x[-1]), cut=cut)
+        self.errors, slopes = drive(car, x, slopes=True, cut=cut)
+        aside = x.copy()
+        aside[-1] += _LAG_STEP
+        lagged = (drive(car, aside, cut=cut)[0] - self.errors) / _LAG_STEP
+        self.slopes = np.column_stack([slopes, lagged])
+
+
+def drive(car: _Car, x: FloatArray, *, slopes: bool = False, cut: bool = False) -> tuple[FloatArray, FloatArray]:
+    """Errors (error,) of the runs at coefficients, and their slopes but for ln T_L."""
+    runs = car.runs(float(x[-1]), cut=cut)
+    return runs.drive(float(np.exp(x[-1])), Coefficients.of(x[:-1], runs.shape), slopes=slopes)
+
+
+def _fitted(car: _Car, sizes: Sizes, x: FloatArray, independent: float) -> _Fit:
+    """Levenberg and Marquardt from `x`."""
+    prior = _Prior(car, sizes)
+    m = prior.moves
+    now, damp = _Fit(car, np.where(m, x, prior.mean)), 1e-3
+    for _ in range(_ROUNDS):
+        mse = max(float((now.errors**2).mean()), 1e-8)
+        value = independent * np.log(mse) + prior.of(now.x)
+        J, k = now.slopes[:, m], independent / (len(now.errors) * mse)
+        H = k * J.T @ J + prior.precision
+        g = k * J.T @ now.errors + prior.precision @ (now.x - prior.mean)[m]
+        for _ in range(5):
+            new = now.x.copy()
+            new[m] -= np.linalg.solve(H + damp * np.diag(np.diag(H)), g)
+            new[-1] = np.clip(new[-1], np.log(0.02), np.log(5.0))
+            after = independent * np.log(max(float((drive(car, new)[0] ** 2).mean()), 1e-8)) + prior.of(new)
+            if after < value:
+                break
+            damp = max(6 * damp, 1e-3)
+        else:
+            break
+        now, damp = _Fit(car, new), max(damp / 6, 1e-6)
+        if value - after < 0.01:
+            break
+    return now
+
+
+# blocks left out ------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Ways of leaving blocks out: `told` (fold, run), runs of the fold's blocks, the others teach; `way` (fold,)."""
+
+    told: BoolArray
+    way: IntArray
+
+    @classmethod
+    def of(cls, runs: Runs, edges: IntArray) -> LeftOut | None:
+        """None where there are fewer than three blocks with runs of their own."""
+        block = np.searchsorted(edges, runs.first, side="right") - 1  # of each run
+        count = len(edges) - 1
+        labels = [np.arange(count) % min(count, _FOLDS)]
+        if count >= 6:
+            labels.append(_alike(runs, edges))
+        each = [(w, label[block] == k) for w, label in enumerate(labels) for k in np.unique(label)]
+        each = [(w, told) for w, told in each if told.any() and not told.all()]
+        return cls(np.array([t for _, t in each]), np.array([w for w, _ in each])) if len(each) > 2 else None
+
+    def worse(self, squares: FloatArray, over: FloatArray) -> float:
+        """Log ratio of the summed squares (fold, ...) of told runs over those of the baseline, by the worse way."""
+        ways = np.unique(self.way)
+        return float(max(np.log(squares[self.way == w].sum() / over[self.way == w].sum()) for w in ways))
+
+
+def _alike(runs: Runs, edges: IntArray) -> IntArray:
+    """Clusters (block,) of blocks by what was driven, none with much more than a third of them (Ward 1963)."""
+    rows = list(itertools.pairwise(edges.tolist()))
+    x = np.array(
+        [[f(y[i:j]) for y in (runs.command, runs.speed) for f in (np.mean, np.std)] for i, j in rows], np.float64
+    )
+    spread = np.repeat([max(float(y.std()), 1e-9) for y in (runs.command, runs.speed)], 2)
+    x = (x - x.mean(0)) / spread
+    out = fcluster(linkage(x, "ward"), int(np.clip(len(rows) // 3, 2, 5)), "maxclust").astype(np.int64)
+    along = x @ np.linalg.svd(x, full_matrices=False)[2][0]
+    for k in np.unique(out):
+        own = np.flatnonzero(out == k)
+        if len(own) > 0.4 * len(rows):
+            out[own[np.argsort(along[own])[len(own) // 2 :]]] = out.max() + 1
+    return out
+
+
+class _Products:
+    """Sums of squares and products of errors and slopes over the runs of each fold, taught and told."""
+
+    def __init__(self, fit: _Fit, left: LeftOut) -> None:
+        self.fit, runs = fit, fit.runs.of_run
+        edges = np.searchsorted(runs, np.arange(len(fit.runs.first)))
+        X = np.column_stack([fit.slopes, fit.errors])
+        ends = np.append(edges[1:], len(X))
+        grams = np.stack([X[i:j].T @ X[i:j] for i, j in zip(edges, ends, strict=True)])
+        counts = (ends - edges).astype(float)
+        flat = grams.reshape(len(grams), -1)
+        self.taught = ((~left.told).astype(float) @ flat).reshape(-1, *grams.shape[1:])
+        self.told = (left.told.astype(float) @ flat).reshape(-1, *grams.shape[1:])
+        self.taught_counts = (~left.told).astype(float) @ counts
+        self.seconds = (~left.told).mean(1)
+
+    def steps(self, prior: _Prior, independent: float) -> FloatArray:
+        """Moves (fold, coefficient) from the fit to what the taught runs of each fold say."""
+        m, x = prior.moves.copy(), self.fit.x
+        m[-1] = False  # runs bend with the lag
+        precision = prior.precision[:-1, :-1]
+        out = np.zeros((len(self.taught), len(x)))
+        at = (x - prior.mean)[m]
+        outside = np.where(prior.moves, 0.0, prior.mean - x)  # what has no size goes back
+        for f, (G, n, share) in enumerate(zip(self.taught, self.taught_counts, self.seconds, strict=True)):
+            A, q = G[:-1, :-1], G[:-1, -1] + G[:-1, :-1] @ outside
+            s = G[-1, -1] + 2 * outside @ G[:-1, -1] + outside @ A @ outside
+            out[f] += outside
+            A, q = A[np.ix_(m, m)], q[m]
+            d = np.zeros(int(m.sum()))
+            for _ in range(3):
+                mse = max((s + 2 * d @ q + d @ A @ d) / n, 1e-8)
+                k = share * independent / (n * mse)
+                d = -np.linalg.solve(k * A + precision, k * q + precision @ at)
+            out[f, m] = d
+        return out
+
+    def squares(self, steps: FloatArray) -> FloatArray:
+        """Sums of squared errors (fold,) of the told runs after these moves, as far as they are linear."""
+        full = np.column_stack([steps, np.ones(len(steps))])
+        return np.maximum(np.einsum("fi,fij,fj->f", full, self.told, full), 1e-12)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedForm:
+    """A free form beside a hypothesis. On blocks left out, as logarithms of the mean squared error over that of the
+    baseline, whose gain the same blocks teach, each by the worse way of leaving out: `score`, with what the form costs,
+    and `named`, of the hypothesis by itself."""
+
+    hypothesis: Hypothesis
+    form: FreeForm
+    score: float
+    named: float
+    car: _Car = field(repr=False)
+    x: FloatArray = field(repr=False)
+    independent: float
+
+    @property
+    def earns_its_place(self) -> bool:
+        """Whether it foretells blocks left out better than names alone, and than the baseline."""
+        return self.form.sizes.any and self.score < min(self.named, 0.0)
+
+    def without(self, rows: Sequence[slice]) -> FloatArray:
+        """Acceleration [m/s²] on the grid that it adds to the hypothesis at `lagged`, taught by the other rows."""
+        car, runs = self.car, self.car.runs(float(self.x[-1]), cut=True)
+        first, last = car.source[runs.first], car.source[runs.end - 1]
+        held = np.any([(last >= r.start) & (first < r.stop) for r in rows], axis=0)
+        x = self.x
+        if held.any() and not held.all():
+            left = LeftOut(held[None], np.zeros(1, np.int64))
+            products = _Products(_Fit(car, x, cut=True), left)
+            x = x + products.steps(_Prior(car, self.form.sizes), self.independent)[0]
+        at = Coefficients.of(x[:-1], runs.shape)
+        force = ForceMap(car.knots_u, car.knots_v, at.table, 0.0)(car.command, car.speed) + at.gain * car.command
+        keep, lagged = np.exp(-car.dt / self.form.T_L), np.empty_like(force)
+        begins = np.append(np.flatnonzero(car.starts), len(force))
+        for i, j in itertools.pairwise(begins):
+            lagged[i:j] = lfilter([1 - keep], [1, -keep], force[i:j], zi=[keep * force[i]])[0]
+        data = car.h.data
+        adds = lagged + np.interp(car.speed, car.knots_v, at.curve)
+        return np.interp(data.grid.time, data.time[car.source], adds)
+
+    @property
+    def lagged(self) -> Hypothesis:
+        """The hypothesis with the lag that the free form was fitted with."""
+        h = self.car.h.copy()
+        h["T_L"] = self.form.T_L
+        return h
+
+
+def fitted_form(h: Hypothesis, baseline: GapPlant | None, bare: Hypothesis) -> FittedForm | None:
+    """The free form beside a hypothesis (its force map, if any, apart) that does best on blocks left out.
+
+    `bare`: what it is scored over. None where no speed was measured, or blocks are too few.
+    """
+    if h.data.speed is None:
+        return None
+    h, bare = _as_a_plant(h), _as_a_plant(bare)
+    lags = np.log(sample(h, chains=1, draws=_DRAWS, seed=0, method="laplace")["T_L"].reshape(-1))
+    car = _Car(h, baseline, (float(np.log(h["T_L"])), max(float(lags.std()), _LEAST_LAG_SD)))
+    runs = car.runs(car.lag[0], cut=True)
+    left = LeftOut.of(runs, car.edges) if len(runs.of_run) else None
+    if left is None:
+        return None
+    independent = max(len(runs.speed) * runs.dt / INDEPENDENT_S, 3.0)
+    base = _Car(bare, baseline, (float(np.log(bare["T_L"])), 1.0))
+    over = _squares(_Fit(base, base.zero, cut=True), _Prior(base, Sizes(0.0, 0.0)), left, independent)
+    errors = drive(car, car.zero, cut=True)[0]
+    named = np.array([_sum_told(errors, runs, told) for told in left.told])
+    found = [_descended(car, left, over, named, sizes, independent) for sizes in _STARTS]
+    return min(found, key=lambda x: x.score)
+
+
+def _as_a_plant(h: Hypothesis) -> Hypothesis:
+    """Without what no plant has: a force map, unnamed linear dynamics. Its lag and gain are refitted where it had."""
+    unnamed = [e for e in h.effects if e.startswith("~")]
+    if not unnamed and h.force is None:
+        return h
+    rest = h.without_map()
+    for e in unnamed:
+        rest = rest.without(e)
+    return fit(rest, 12) if unnamed else rest.evaluate()
+
+
+def _squares(fit: _Fit, prior: _Prior, left: LeftOut, independent: float) -> FloatArray:
+    """Sums of squared errors (fold,) of the told runs, driven with what the other runs of each fold teach."""
+    steps = _Products(fit, left).steps(prior, independent)
+    runs = fit.runs
+    errors = (drive(fit.car, fit.x + d, cut=True)[0] for d in steps)
+    return np.array([_sum_told(e, runs, told) for e, told in zip(errors, left.told, strict=True)])
+
+
+def _descended(
+    car: _Car, left: LeftOut, over: FloatArray, named: FloatArray, sizes: Sizes, independent: float
+) -> FittedForm:
+    """From one choice of sizes to the best in its reach: the lag follows the sizes, and these the lag."""
+    fit = _fitted(car, sizes, car.zero, independent)
+    for _ in range(_DESCENTS):
+        products = _Products(_Fit(car, fit.x, cut=True), left)
+
+        def score(z: Sizes, products: _Products = products) -> float:
+            squares = products.squares(products.steps(_Prior(car, z), independent))
+            return left.worse(squares, over) + 2 * z.nats / independent
+
+        best = min((Sizes(r, f) for r in SIZES for f in SIZES), key=score)
+        if best == sizes:
+            break
+        sizes = best
+        fit = _fitted(car, sizes, fit.x, independent)
+    told = _squares(_Fit(car, fit.x, cut=True), _Prior(car, sizes), left, independent)
+    at = Coefficients.of(fit.x[:-1], fit.runs.shape)
+    form = FreeForm(car.knots_u, car.knots_v, at, sizes, float(np.exp(fit.x[-1])))
+    score_of = left.worse(told, over) + 2 * sizes.nats / independent
+    return FittedForm(car.h, form, score_of, left.worse(named, over), car, fit.x, independent)
+
+
+def _sum_told(errors: FloatArray, runs: Runs, told: BoolArray) -> float:
+    return float((errors[told[runs.of_run]] ** 2).sum())

@@ -1,0 +1,17 @@
+"""What the error that is left is said to be."""
+
+from __future__ import annotations
+
+from avtorch.gap import Unexplained
+from avtorch.gap.quantity import Quantity
+
+
+def rest(q05: float, q95: float) -> str:
+    share = Quantity(0.0, 0.0, 0.0, 0.0)
+    return Unexplained(share, material=False, still=Quantity(q05, 0.0, q05, q95)).rest(0.03)
+
+
+def test_it_is_noise_only_where_no_black_box_could_take_off_what_matters() -> None:
+    assert rest(0.0, 0.02) == "noise"
+    assert rest(0.12, 0.3) == "noise but for 12 to 30 %, which a black box may still foretell"
+    assert rest(0.0, 0.3).startswith("noise but for 0 to 30 %")

@@ -1,0 +1,72 @@
+"""The free form of a repaired simulator, fitted to free runs and judged on blocks left out."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from avtorch.gap import ForceTable, GapPlant, ResistanceCurve, plant
+from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.gauss_newton import fit
+from avtorch.gap.engine.recorder import base_fit
+from avtorch.gap.result.free_form import FittedForm, Sizes, fitted_form
+from avtorch.gap.result.output_error import Coefficients, Runs
+from tests.gap.cars import log_of
+
+MAP = ForceTable((-2.0, 0.0, 2.0), (5.0, 30.0), ((1.0, 0.6), (0.0, 0.0), (-0.2, -1.2)))
+DRAG = ResistanceCurve((5.0, 30.0), (-0.1, -0.5))
+
+
+@cache
+def found(mapped: bool, seconds: float = 120.0) -> FittedForm:
+    log = log_of([MAP, DRAG] if mapped else [], seconds=seconds, seed=1)
+    base = fit(base_fit(DriveData.of(log)))
+    form = fitted_form(base, plant([]), base)
+    assert form is not None
+    return form
+
+
+def test_a_car_with_a_map_is_foretold_better_with_one() -> None:
+    form = found(True)
+    assert form.earns_its_place
+    assert form.score < -1.0
+    car = form.form.beside(plant([], T_L=0.3))
+    assert GapPlant.from_toml(car.to_toml()).to_toml() == car.to_toml()
+    assert 0.1 < float(car.T_L) < 0.6
+
+
+def test_a_car_without_one_comes_back_without_it() -> None:
+    form = found(False)
+    assert not form.earns_its_place or form.score > -0.5
+
+
+def test_what_a_block_tells_does_not_teach_it() -> None:
+    form = found(True)
+    rows = [slice(0, 400)]
+    apart, whole = form.without(rows), form.without([])
+    assert 0.0 < float(np.abs(apart - whole).max()) < 1.0
+
+
+def test_slopes_of_free_runs_are_their_derivatives() -> None:
+    rng = np.random.default_rng(0)
+    n, starts = 200, np.zeros(200, bool)
+    starts[[0, 100]] = True
+    command, speed = rng.normal(size=n), 10 + np.cumsum(rng.normal(size=n)) * 0.1
+    knots = (np.array([-1.0, 0.0, 1.0]), np.array([8.0, 10.0, 12.0]))
+    runs = Runs.of(0.1, command, speed, 0.1 * command, np.arange(n), starts, *knots)
+    x = 0.3 * rng.normal(size=13)
+    _, slopes = runs.drive(0.3, Coefficients.of(x, (3, 3)), slopes=True)
+    for k in range(len(x)):
+        ends = []
+        for sign in (-1, 1):
+            moved = x.copy()
+            moved[k] += sign * 1e-6
+            ends.append(runs.drive(0.3, Coefficients.of(moved, (3, 3)))[0])
+        assert slopes[:, k] == pytest.approx((ends[1] - ends[0]) / 2e-6, abs=1e-4)
+
+
+def test_a_table_costs_more_without_a_resistance() -> None:
+    assert Sizes(0.2, 0.2).nats < Sizes(0.0, 0.2).nats
+    assert not Sizes(0.0, 0.0).any
