@@ -21,6 +21,7 @@ from avtorch.plots.diagnosis import (
     which_figure,
 )
 from avtorch.plots.experiment import experiment_figure
+from avtorch.plots.free_form import driven_cells, free_form_figure
 from avtorch.plots.whole_drive import DriveTime, drive_figure, drive_panels, drive_time
 from avtorch.report.curves import Rows
 from avtorch.report.entries import budget_table, candidate_table, measure_table
@@ -53,6 +54,7 @@ def pictures(found: Diagnosis, experiment: Experiment | None = None) -> dict[str
     """
     return {
         "budget": _budget(found),
+        "free_form": _free_form(found),
         "drive": _drive(found),
         "road": _road(found),
         "where": _where(found),
@@ -100,6 +102,36 @@ def _without_parts(found: Diagnosis, budget: Budget) -> Picture:
         "drive not used for fitting. Noise is what commands, speed and place do not predict; what is unexplained is "
         f"reproducible, and no known effect reduces it.{counts}",
         opened=True,
+    )
+
+
+def _free_form(found: Diagnosis) -> Picture | None:
+    form = found.free_form
+    if form is None:
+        return None
+    u, v = form.knots_u, form.knots_v
+    columns, rows, says = ["speed [m/s]"], v[:, None], []
+    if form.sizes.table > 0:
+        driven = driven_cells(found)[2].mean()
+        says.append(
+            f"Contours of the force beyond K u over speed, {v[0]:.3g} to {v[-1]:.3g} m/s, and command, {u[0]:.2g} to "
+            f"{u[-1]:.2g} m/s²: {form.at.table.min():.2g} to {form.at.table.max():.2g} m/s²; {100 * driven:.0f} % of "
+            "the cells were driven."
+        )
+        columns += [f"force beyond K u at {x:.2g} m/s² [m/s²]" for x in u]
+        rows = np.column_stack([rows, form.at.table.T])
+    if form.sizes.resistance > 0:
+        says.append(f"A line of the resistance: {form.at.curve.min():.2g} to {form.at.curve.max():.2g} m/s².")
+        columns.append("resistance [m/s²]")
+        rows = np.column_stack([rows, form.at.curve])
+    return picture_of(
+        "free_form",
+        lambda narrow: free_form_figure(found, narrow=narrow),
+        " ".join(says),
+        of_numbers("What the repaired simulator carries without a name", tuple(columns), rows, (".3g",) * len(columns)),
+        caption="What the car's force does beyond the gain and what was named, as the repaired simulator carries it. "
+        "Hatched: not driven; there it goes back to K u. A dead band, a limit or an asymmetry of the drive may hide "
+        "in it.",
     )
 
 
