@@ -304,7 +304,6 @@ def test_an_interruption_leaves_the_older_answer_and_its_pictures(
             "AFTER: missing; needs a file, or two of --simulator and --simulated, see avtorch compare --help",
         ),
         (["run"], "--out: missing; needs a folder for the answer and the pictures, such as --out out/run"),
-        (["blindtest", "--out", "here"], "--n: missing; see avtorch blindtest --help"),
     ],
     ids=lambda x: x[0] if isinstance(x, list) else "",
 )

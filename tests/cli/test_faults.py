@@ -10,7 +10,6 @@ import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -30,17 +29,14 @@ import avtorch.report
 import avtorch.report.comparison_page
 import avtorch.report.validation_page
 import avtorch.results
-import avtorch.trial.work
 import avtorch.validation
 import avtorch.vehicle.stability
-from avtorch import trial
-from avtorch.blindtest import draw_case
 from avtorch.cli import main
 from avtorch.gap import DeadTime, plant
 from tests.cli.test_diagnose import answer, columns, write
 from tests.faulty_disk import disk, fails, interrupts, tree, visible
 
-STATE = frozenset({"fits.json", "fits_of.json", "trial.json"})
+STATE = frozenset({"fits.json", "fits_of.json"})
 """Files kept for resuming; they belong to no answer."""
 
 
@@ -186,20 +182,8 @@ def paper(c: Command) -> None:
         c.stand_in(sys.modules["avtorch.cli.paper"], name, lambda _: "")
 
 
-def blindtest(c: Command) -> None:
-    """The new answer is of one case more, which is drawn, answered and kept on the way."""
-    line = ["blindtest", "--seed", "3", "--rivals", "none", "--resume", "--n"]
-    c.lines = {"old": [*line, "1"], "new": [*line, "2"]}
-    c.stand_in(trial, "avtorch", lambda log: trial.reply(log, {"none": 1.0}, why="always"))
-    c.stand_in(sys.modules["avtorch.blindtest.score"], "bootstrap", lambda *_, **__: None)
-    clock = SimpleNamespace(perf_counter=lambda: 0.0, process_time=lambda: 0.0)
-    c.monkeypatch.setattr(avtorch.trial.work, "time", clock)
-    cases = cache(lambda index: draw_case(index, 3, seconds=60.0))
-    c.stand_in(avtorch.trial.work, "draw_case", lambda index, *_, **__: cases(index))
-
-
 QUICK = [stability, comparison]
-COMMANDS = [*QUICK, run, estimate, diagnose, follower, validate, paper, blindtest]
+COMMANDS = [*QUICK, run, estimate, diagnose, follower, validate, paper]
 
 
 @pytest.fixture(
