@@ -26,6 +26,7 @@ import avtorch.paper
 import avtorch.plots.style
 import avtorch.report
 import avtorch.report.comparison_page
+import avtorch.report.page
 import avtorch.report.validation_page
 import avtorch.results
 import avtorch.validation
