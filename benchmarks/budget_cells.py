@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from avtorch.blindtest.intervals import wilson
 from avtorch.gap import Budget
 from avtorch.gap.quantity import Quantity
+from benchmarks.blindtest.intervals import wilson
 
 
 def interval(q: Quantity) -> str:

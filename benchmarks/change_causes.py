@@ -20,12 +20,12 @@ from pathlib import Path
 import numpy as np
 
 from avtorch import Log, compare
-from avtorch.blindtest import MANOEUVRES, Car, DrivePlan, Recorder, draw_car, draw_recorder, put_in_front, simulate
-from avtorch.blindtest.intervals import wilson
 from avtorch.errors import InputError
 from avtorch.gap import gap_budget
 from avtorch.gap.answer.change import ChangeCause
 from avtorch.gap.result.comparison import Comparison
+from benchmarks.blindtest import MANOEUVRES, Car, DrivePlan, Recorder, draw_car, draw_recorder, put_in_front, simulate
+from benchmarks.blindtest.intervals import wilson
 
 TRAINING = "roboracer/ftg_stanley_total_training.csv"
 VALIDATION = "roboracer/ftg_stanley_total_validation.csv"

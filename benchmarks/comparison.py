@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from avtorch import Log, compare
-from avtorch.blindtest import MANOEUVRES, Case, draw_case, simulate
-from avtorch.blindtest.intervals import wilson
+from benchmarks.blindtest import MANOEUVRES, Case, draw_case, simulate
+from benchmarks.blindtest.intervals import wilson
 
 NONE = {"none": 1.0, "single": 0.0, "pair": 0.0, "outside": 0.0}
 LONGER = 1.2

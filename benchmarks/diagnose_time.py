@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.diagnose_time [--n 24] [--seed 1]``
 
-Blind cases of every kind (`avtorch.blindtest`: no cause, one, two, several, and causes outside the table) on drives of
+Blind cases of every kind (benchmarks/blindtest: no cause, one, two, several, and causes outside the table) on drives of
 300 s at 100 Hz, every other one behind an ordinary recorder. Processor seconds of `diagnose`, with one thread.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from avtorch import diagnose
-from avtorch.blindtest import Case, Recorder, draw_case
+from benchmarks.blindtest import Case, Recorder, draw_case
 
 SECONDS, RATE_HZ = 300.0, 100
 MIX = {"none": 0.2, "single": 0.35, "pair": 0.15, "outside": 0.15, "several": 0.15}

@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from avtorch.blindtest import IN_FRONT, put_in_front
-from avtorch.blindtest.in_front_score import SIZE_OF, SIZE_WITHIN
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, Budget, Part, gap_budget
 from avtorch.gap.engine.coordinates import EFFECTS as TRIED
@@ -23,6 +21,8 @@ from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.parameters import table_quantities
 from avtorch.io import Log
+from benchmarks.blindtest import IN_FRONT, put_in_front
+from benchmarks.blindtest.in_front_score import SIZE_OF, SIZE_WITHIN
 from benchmarks.budget_cells import causes, counted
 
 _COLUMNS = (

@@ -3,7 +3,7 @@
 ``OMP_NUM_THREADS=1 python -m benchmarks.engine_trial MODULE:FUNCTION --out out/engine_trial --cell dev --cases 30``
 
 Draws the cases of a cell, lets the function answer those that it has not answered, and prints a table and its misses.
-A cell is a name; it and the tier give the seed. Each tier is a set of its own, drawn by `avtorch.blindtest.draw_case`
+A cell is a name; it and the tier give the seed. Each tier is a set of its own, drawn by `blindtest.draw_case`
 in the blind test's mix (25 % none, 40 % single, 20 % pair, 15 % outside, exact in every 20 cases) with its single and
 outside causes of that tier; none and pair have no tier. 40 cases of a set are 10 none, 16 single, 8 pair and 6
 outside: the sixths among the outside causes, and 60 cars without a cause in three tiers behind two recorders, are those
@@ -13,7 +13,7 @@ twin.
 `FUNCTION` takes an `avtorch.Log`, or with `--csv` the path of the log, and returns an `avtorch.Diagnosis` or a dict of
 `avtorch.diagnosis/1` or `/2`. Without one the cases are drawn and nothing is answered. The folder holds
 ``RECORDER/TIER/logs/case_00000.csv`` and ``RECORDER/TIER/truth/case_00000.json`` (not for a diagnosis to read), and
-under ``answers/NAME`` one file an answer, and ``score.json``: all measures of `avtorch.blindtest.score`. A second call
+under ``answers/NAME`` one file an answer, and ``score.json``: all measures of `blindtest.score`. A second call
 goes on where the first ended; several calls may share a folder. After a change of an engine give `--again`, or another
 `--name`, so that `--against` compares both.
 
@@ -33,8 +33,6 @@ import argparse
 import hashlib
 import json
 import sys
-import time
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -44,14 +42,14 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from avtorch.blindtest import MIX, TIERS, draw_case, score
-from avtorch.blindtest.answers import Answered, read_answer
-from avtorch.blindtest.cases import SIGNALS, Recording
-from avtorch.blindtest.intervals import wilson
 from avtorch.errors import InputError
 from avtorch.io import Log, write_json
-from avtorch.io.answers import json_text
-from avtorch.trial.pool import worked
+from benchmarks.blindtest import MIX, TIERS, draw_case, score
+from benchmarks.blindtest.answers import Answered, read_answer
+from benchmarks.blindtest.cases import SIGNALS, Recording
+from benchmarks.blindtest.intervals import wilson
+from benchmarks.blindtest.pool import worked
+from benchmarks.blindtest.trial import ask
 
 RECORDERS: tuple[Recording, ...] = get_args(Recording)
 TIERS_TRIED = ("easy", "medium", "hard")
@@ -126,22 +124,7 @@ class Method:
     def answer(self, place: Place, truth: Mapping[str, Any]) -> dict[str, Any]:
         """One answer with what it cost; a failure is an answer too, and its traceback is kept."""
         given = str(place.log_path) if self.by_csv else Log.read(place.log_path)
-        function = loaded(self.function)
-        answer = error = None
-        wall, cpu = time.perf_counter(), time.process_time()
-        try:
-            found = function(given)
-            answer = dict(found if isinstance(found, Mapping) else found.to_dict())
-        except Exception:
-            error = traceback.format_exc()
-        spent = {"seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
-        if answer is not None:
-            try:
-                read_answer(truth, answer)
-                json_text(answer)
-            except (InputError, KeyError, TypeError, ValueError, AttributeError):
-                answer, error = None, traceback.format_exc()
-        return {"answer": answer, "error": error, **spent}
+        return ask(loaded(self.function), given, truth)
 
 
 @cache

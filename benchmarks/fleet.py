@@ -21,10 +21,10 @@ from functools import partial
 from pathlib import Path
 
 import avtorch
-from avtorch.blindtest import draw_case
 from avtorch.decision.settings import Setting
 from avtorch.fleet import FleetSettings, read_rows, run_fleet
 from avtorch.fleet.cluster import Cluster, connected
+from benchmarks.blindtest import draw_case
 
 
 def by_themselves(paths: Sequence[Path], settings: FleetSettings) -> None:

@@ -30,7 +30,6 @@ from typing import Any
 
 import psutil
 
-from avtorch.blindtest import draw_case
 from avtorch.fleet import FleetSettings, read_rows, run_fleet
 from avtorch.fleet.cluster import Cluster
 from avtorch.fleet.places import content_hash
@@ -38,6 +37,7 @@ from avtorch.fleet.rows import DATASETS
 from avtorch.fleet.settings import Step
 from avtorch.fleet.task import Task, work
 from avtorch.io import write_json
+from benchmarks.blindtest import draw_case
 
 _OWN = ("car", "log", "date", "tags", "sha256", "version", "seconds")
 """Columns that an answer has from the fleet, or that differ from run to run."""

@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 
 from avtorch import diagnose
-from avtorch.blindtest import Case, Recorded, draw_cases, simulate
-from avtorch.blindtest.intervals import wilson
 from avtorch.experiment import Experiment, Limits, next_experiment
 from avtorch.io import Log
+from benchmarks.blindtest import Case, Recorded, draw_cases, simulate
+from benchmarks.blindtest.intervals import wilson
 
 _LATER_S = 60.0  # after the log's end the manoeuvre begins
 

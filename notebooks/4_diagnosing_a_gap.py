@@ -15,11 +15,11 @@ from matplotlib.figure import Figure
 
 import avtorch
 from avtorch import plots
-from avtorch.blindtest import Recorded, draw_cases, simulate
 from avtorch.display import show
 from avtorch.experiment import Limits, next_experiment
 from avtorch.gap import plant
 from avtorch.plots import diagnosis as over_diagnosis
+from benchmarks.blindtest import Recorded, draw_cases, simulate
 
 mpl.rcParams.update(plots.STYLE)
 OUT = Path("out/notebooks/4_diagnosing_a_gap")

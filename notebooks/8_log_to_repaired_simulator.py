@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 
 import avtorch
 from avtorch import plots
-from avtorch.blindtest import Car, DrivePlan, Recorder, simulate
 from avtorch.decision import Setting
 from avtorch.display import show
 from avtorch.external.driven_plant import DrivenPlant
@@ -23,6 +22,7 @@ from avtorch.external.driving import driven_along
 from avtorch.gap import plant
 from avtorch.plots import diagnosis as over_diagnosis
 from avtorch.remedy import setting_for, to_autoware
+from benchmarks.blindtest import Car, DrivePlan, Recorder, simulate
 
 mpl.rcParams.update(plots.STYLE)
 OUT = Path("out/notebooks/8_log_to_repaired_simulator")
@@ -189,7 +189,7 @@ print({name: round(error, 2) for name, error in errors.items()}, "m/s, root mean
 # - Leave one cause out of `LACKS`. Is the other one found alone, and what does the controller need then?
 # - Repair half: `plant(baseline="T_L=0.45, constant_resistance=0.2")`. How much of the gain on the second drive is
 #   left, and how much of the peak gain?
-# - Give the car a cause outside the table: `avtorch.blindtest.draw_cases(1, 2026, mix={"outside": 1.0}, seconds=90.0)`.
+# - Give the car a cause outside the table: `blindtest.draw_cases(1, 2026, mix={"outside": 1.0}, seconds=90.0)`.
 #   How much of the gap is unexplained, and where does it lie?
 # - Hand it on as an FMU: `avtorch.external.write_fmu(found, "better.fmu")` ([FMUs](../docs/fmu.md)).
 # - A simulator that is a program, and no plant: [notebook 7](7_your_simulator.ipynb).

@@ -17,6 +17,9 @@ from errno import EIO, ENOSPC, EROFS
 from pathlib import Path
 from typing import Any
 
+from avtorch.errors import InputError
+from avtorch.io import read_answer
+
 Call = Callable[[int, str], None]
 """Takes the number of a call, from 1 on, and its name; may raise in its place."""
 
@@ -56,6 +59,28 @@ def visible(folder: Path, *, besides: frozenset[str] = frozenset()) -> dict[str,
     }
 
 
+def old_or_new(
+    folder: Path, answer: str, old: dict[str, str], new: dict[str, str], *, besides: frozenset[str] = frozenset()
+) -> str:
+    """What a reader finds of the JSON `answer` and its files: `old`, `new`, or `mixed`, which `read_answer` refuses.
+
+    Each file is whole, the old one or the new one; and what is not refused is all of one answer.
+    """
+    seen = visible(folder, besides=besides)
+    for name in old.keys() | new.keys() | seen.keys():
+        assert seen.get(name) in (old.get(name), new.get(name)), name
+    try:
+        files = read_answer(folder / answer).get("files", {})
+    except InputError:
+        assert seen != new
+        return "old" if seen == old else "mixed"
+    listed = {name: seen[name] for name in (answer, *files)}
+    if listed.items() <= new.items() and seen == new:
+        return "new"
+    assert listed.items() <= old.items() or listed.items() <= new.items()
+    return "old" if listed.items() <= old.items() else "new"
+
+
 def tree(folder: Path) -> tuple[tuple[str, str], ...]:
     """The whole content of a folder, hidden files included; equal for folders that differ only in the names of sets."""
     found = []
@@ -70,12 +95,11 @@ def tree(folder: Path) -> tuple[tuple[str, str], ...]:
     called: dict[str, str] = {}
 
     def same(text: str) -> str:
-        return re.sub(
-            r"set-\w+|(?<=\.)\w{8}(?=\.part)", lambda m: called.setdefault(m.group(), f"<{len(called)}>"), text
-        )
+        passing = r"(?<=\.avtorch-)\w+|(?<=\.)\w{8}(?=\.part)"
+        return re.sub(passing, lambda m: called.setdefault(m.group(), f"<{len(called)}>"), text)
 
     # in the order of what they hold, as the names are drawn by chance
-    by_content = sorted(found, key=lambda one: (re.sub(r"set-\w+|\.\w{8}\.part", "", one[0]), one[1]))
+    by_content = sorted(found, key=lambda one: (re.sub(r"\.avtorch-\w+|\.\w{8}\.part", "", one[0]), one[1]))
     return tuple((same(name), same(what)) for name, what in by_content)
 
 

@@ -11,12 +11,12 @@ import pytest
 from avtorch.cli import main
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-PAGES = ("diagnosis.md", "blindtest.md", "compare.md", "fleet.md", "followers.md", "paper.md", "watch.md")
+PAGES = ("diagnosis.md", "compare.md", "fleet.md", "followers.md", "paper.md", "watch.md")
 ALL = [DOCS.parent / "README.md", *sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("effects/*.md"))]
 # with tests of their own: tests/gap/simulator/test_own_effect_page.py, tests/test_gallery.py, tests/test_tutorial.py
 ELSEWHERE = ("gallery.md", "own-effect.md", "tutorial.md")
 CODE = [p.name for p in ALL[1:] if "```python" in p.read_text(encoding="utf-8") and p.name not in ELSEWHERE]
-SLOW = ("blindtest.md", "coming-from.md", "compare.md", "diagnosis.md", "fleet.md", "fmu.md")
+SLOW = ("coming-from.md", "compare.md", "diagnosis.md", "fleet.md", "fmu.md")
 SLOW += ("followers.md", "pedals.md", "simulators.md")
 COMMANDS = {"diagnosis.md": "diagnose", "followers.md": "diagnose"}
 

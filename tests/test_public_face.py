@@ -56,7 +56,7 @@ def test_estimate_imports_no_more_than_it_needs(tmp_path: Path) -> None:
     tokens = ["estimate", str(tmp_path / "drive.csv"), "--out", str(tmp_path / "out"), "--estimator", "map", "--quiet"]
     heavy = (
         *("scipy", "sympy", "pandas", "pyarrow", "pyro", "arviz"),
-        *("avtorch.gap", "avtorch.validation", "avtorch.paper", "avtorch.blindtest"),
+        *("avtorch.gap", "avtorch.validation", "avtorch.paper"),
     )
     code = (
         f"import sys; from avtorch.cli.app import main; assert main({tokens!r}) == 0;"

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 from cyclopts import App, CycloptsError, MissingArgumentError
 
-from avtorch.cli.blindtest import blindtest
 from avtorch.cli.check import check
 from avtorch.cli.check_simulator import check_simulator
 from avtorch.cli.command_line import given
@@ -38,7 +37,7 @@ app = App(
 app.command(check)
 app.command(check_simulator)
 app.command(watch)
-for _command in (run, estimate, diagnose, compare, fleet, stability, validate, blindtest, paper):
+for _command in (run, estimate, diagnose, compare, fleet, stability, validate, paper):
     app.command(alone_in_out(_command))
 
 

@@ -11,7 +11,7 @@ Example:
     (400, 20.0, 1)
 """
 
-from avtorch.io.answer_set import answer_set
+from avtorch.io.answer_set import answer_set, read_answer
 from avtorch.io.answers import write_json
 from avtorch.io.atomic import atomic
 from avtorch.io.fingerprint import fingerprint
@@ -41,6 +41,7 @@ __all__ = [
     "check",
     "fingerprint",
     "held",
+    "read_answer",
     "read_following",
     "read_leader",
     "read_sealed",

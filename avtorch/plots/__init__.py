@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from avtorch.plots.signatures import effect_signature, signature_figure
     from avtorch.plots.style import STYLE, save, show
     from avtorch.plots.time import belief_band, data_quality, events, motion, string_probability
-    from avtorch.plots.verdicts import confusion, confusion_figure
     from avtorch.plots.whole_drive import diagnosis_figure
 
 _HOME = {
@@ -113,10 +112,6 @@ _HOME = {
         "motion",
         "string_probability",
     ),
-    "avtorch.plots.verdicts": (
-        "confusion",
-        "confusion_figure",
-    ),
     "avtorch.plots.whole_drive": ("diagnosis_figure",),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
@@ -129,8 +124,6 @@ __all__ = [
     "belief_band",
     "belief_figure",
     "calibration_figure",
-    "confusion",
-    "confusion_figure",
     "data_quality",
     "diagnosis_figure",
     "ecdf_difference",

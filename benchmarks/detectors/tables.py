@@ -11,7 +11,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from avtorch.blindtest.intervals import wilson
+from benchmarks.blindtest.intervals import wilson
 from benchmarks.detectors.drives import Beliefs
 from benchmarks.detectors.judge import DETECTORS, first_alarm
 

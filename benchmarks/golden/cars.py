@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from avtorch import Leader, LinearController, Log
 from avtorch import simulate as follow
-from avtorch.blindtest import Car, DrivePlan, Recorded, simulate
 from avtorch.gap import plant
+from benchmarks.blindtest import Car, DrivePlan, Recorded, simulate
 
 RATE_HZ = 25
 CAR = Car(T_L=0.3, K_L=0.95)

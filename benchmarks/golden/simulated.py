@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from avtorch import diagnose
-from avtorch.blindtest import Case, draw_case
 from avtorch.io import fingerprint
+from benchmarks.blindtest import Case, draw_case
 from benchmarks.golden.facts import Answer, diagnosis_facts, timed
 
 SEED = 20265001

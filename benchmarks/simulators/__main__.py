@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from avtorch.blindtest.intervals import wilson
+from benchmarks.blindtest.intervals import wilson
 from benchmarks.simulators.answers import WAYS, answered
 from benchmarks.simulators.cases import behind_a_recorder, draw
 

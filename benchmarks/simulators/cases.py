@@ -17,9 +17,9 @@ import numpy as np
 
 from avtorch import Log
 from avtorch.arrays import FloatArray
-from avtorch.blindtest import EFFECTS, Car, draw_car, draw_drive, draw_recorder, simulate
-from avtorch.blindtest.strength import excess_range, solve_strength
 from avtorch.io import STANDSTILL_MPS
+from benchmarks.blindtest import EFFECTS, Car, draw_car, draw_drive, draw_recorder, simulate
+from benchmarks.blindtest.strength import excess_range, solve_strength
 from benchmarks.simulators.vehicle import Effects, SteppedVehicle, whole_drive
 
 SECONDS, RATE_HZ = 100.0, 50

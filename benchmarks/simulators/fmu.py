@@ -18,7 +18,7 @@ from pathlib import Path
 
 from pythonfmu import DefaultExperiment, Fmi2Causality, Fmi2Initial, Fmi2Slave, Fmi2Variability, Real
 
-from avtorch.blindtest import Car
+from benchmarks.blindtest import Car
 from benchmarks.simulators.vehicle import SteppedVehicle
 
 

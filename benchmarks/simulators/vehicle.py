@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.blindtest import Car, Recorded, simulate
-from avtorch.blindtest.actuator import actuator
-from avtorch.blindtest.body import forces
-from avtorch.blindtest.car import STEP_S
-from avtorch.blindtest.command import Command
+from benchmarks.blindtest import Car, Recorded, simulate
+from benchmarks.blindtest.actuator import actuator
+from benchmarks.blindtest.body import forces
+from benchmarks.blindtest.car import STEP_S
+from benchmarks.blindtest.command import Command
 
 Effects = Mapping[str, Mapping[str, float]]
 OWN = {"dead_time", "second_order_actuator", "speed_dependent_gain", "aerodynamic_drag"}

@@ -1,7 +1,7 @@
 """Pages are written for a code host, as plain Markdown with relative links. Here the site learns to follow them.
 
 A link to a file of `../avtorch` leads to its listing on the site, a link to a package to its page of the reference, and
-one to `../README.md` or `../notebooks/README.md` to the copy made here, one to a notebook to its page.
+one to the `README.md` of the root or of a folder of `OUTSIDE` to the copy made here, one to a notebook to its page.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from posixpath import normpath
 from urllib.parse import unquote, urlsplit
 
 import reference
@@ -18,7 +19,7 @@ from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
 # Pages that lie outside: their folder beside the root, and what they are called here.
-OUTSIDE = {"": "readme.md", "notebooks/": "notebooks.md"}
+OUTSIDE = {"": "readme.md", "notebooks/": "notebooks.md", "benchmarks/blindtest/": "blindtest.md"}
 
 LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)#\s]+)")
 
@@ -29,7 +30,7 @@ def outside(app: Sphinx) -> None:
     made.mkdir(exist_ok=True)
     for folder, page in OUTSIDE.items():
         text = (root / folder / "README.md").read_text(encoding="utf-8")
-        text = LINK.sub(lambda m, folder=folder: f"../../{folder}{m[1]}", text)
+        text = LINK.sub(lambda m, folder=folder: f"../../{normpath(folder + m[1])}", text)
         target = made / page
         if not target.exists() or target.read_text(encoding="utf-8") != text:
             target.write_text(text, encoding="utf-8")
@@ -45,7 +46,7 @@ def read(app: Sphinx, docname: str, content: list[str]) -> None:
 
 
 def on_site(link: str, up: str) -> str:
-    readme = re.fullmatch(r"(?:\.\./)+(notebooks/)?README\.md(#.*)?", link)
+    readme = re.fullmatch(r"(?:\.\./)+(notebooks/|benchmarks/blindtest/)?README\.md(#.*)?", link)
     if readme:
         return f"{up}{FOLDER}/{OUTSIDE[readme[1] or '']}{readme[2] or ''}"
     notebook = re.fullmatch(r"(?:\.\./)+(notebooks/\w+\.ipynb)", link)

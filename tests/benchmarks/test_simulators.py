@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avtorch.blindtest import Car
 from avtorch.external import FmuSimulator
+from benchmarks.blindtest import Car
 from benchmarks.simulators.answers import WAYS
 from benchmarks.simulators.fmu import write_fmu
 from benchmarks.simulators.vehicle import OWN, SteppedVehicle, whole_drive

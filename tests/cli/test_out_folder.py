@@ -16,7 +16,7 @@ from avtorch.cli.app import app
 from avtorch.cli.out_folder import alone_in_out
 from avtorch.io import sole_use
 
-COMMANDS = {"run", "estimate", "diagnose", "compare", "fleet", "stability", "validate", "blindtest", "paper"}
+COMMANDS = {"run", "estimate", "diagnose", "compare", "fleet", "stability", "validate", "paper"}
 
 
 def test_every_command_that_writes_holds_its_folder() -> None:
@@ -40,7 +40,6 @@ ARGUMENTS = {
     "fleet": ["fleet", "logs"],
     "stability": ["stability"],
     "validate": ["validate"],
-    "blindtest": ["blindtest"],
     "paper": ["paper"],
     "watch": ["watch", "drive.csv"],
 }

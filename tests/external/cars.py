@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from avtorch.blindtest import Car, DrivePlan, Recorded, simulate
 from avtorch.io import Log
+from benchmarks.blindtest import Car, DrivePlan, Recorded, simulate
 
 OWN: dict[str, dict[str, float]] = {
     "second_order_actuator": {"natural_frequency_radps": 6.0, "damping_ratio": 0.8},

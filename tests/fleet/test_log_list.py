@@ -11,7 +11,7 @@ import pytest
 from avtorch.errors import InputError
 from avtorch.fleet import find_logs, run_fleet
 from avtorch.fleet.places import content_hash, fetched
-from avtorch.io import write_json
+from avtorch.io import answer_set, write_json
 from tests.fleet.drives import QUICK, drive, write_fleet
 
 
@@ -89,9 +89,9 @@ def test_a_folder_is_searched_for_what_can_be_read(here: Path) -> None:
 def test_what_avtorch_wrote_in_a_folder_is_no_log(here: Path, scheduler: str) -> None:
     write_fleet(here, {"red": 0.4})
     run_fleet(".", "red/out", settings=QUICK, scheduler=scheduler)
-    Path("red/.avtorch/answer").mkdir(parents=True)
-    touch("red/.avtorch/answer/manoeuvre.csv")
-    os.symlink(".avtorch/answer/manoeuvre.csv", "red/manoeuvre.csv")
+    with answer_set("red", ["diagnosis.json", "manoeuvre.csv"]) as staged:
+        write_json(staged / "diagnosis.json", {})
+        (staged / "manoeuvre.csv").touch()
     assert [log.place for log in find_logs(".").logs] == ["red/drive.csv"]
     drive().write("red/drive.parquet")
     assert len(find_logs(".").logs) == 2

@@ -8,11 +8,11 @@ import pytest
 
 import avtorch
 from avtorch import diagnose
-from avtorch.blindtest import draw_case
 from avtorch.errors import InputError
 from avtorch.gap.effects import SensorBias
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log
+from benchmarks.blindtest import draw_case
 from tests.gap.cars import log_of
 
 

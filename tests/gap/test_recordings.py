@@ -13,9 +13,6 @@ import pytest
 import torch
 
 import avtorch
-from avtorch.blindtest.car import Car
-from avtorch.blindtest.drives import Recorded
-from avtorch.blindtest.vehicle import simulate
 from avtorch.gap import RoadGrade
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import fit
@@ -25,6 +22,9 @@ from avtorch.gap.engine.sample import sample
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.parameters import road_along
 from avtorch.io import Log
+from benchmarks.blindtest.car import Car
+from benchmarks.blindtest.drives import Recorded
+from benchmarks.blindtest.vehicle import simulate
 
 LAPS = (1, 2, 3)
 

@@ -13,14 +13,14 @@ import pytest
 import torch
 
 import avtorch
-from avtorch.blindtest.car import Car
-from avtorch.blindtest.drives import DrivePlan as Plan
-from avtorch.blindtest.drives import Recorded
-from avtorch.blindtest.vehicle import Run, simulate
 from avtorch.errors import InputError
 from avtorch.gap import AerodynamicDrag, RoadGrade, SensorLag, SimulatorInput, plant
 from avtorch.gap.drive_record import Record
 from avtorch.io import Log
+from benchmarks.blindtest.car import Car
+from benchmarks.blindtest.drives import DrivePlan as Plan
+from benchmarks.blindtest.drives import Recorded
+from benchmarks.blindtest.vehicle import Run, simulate
 from tests.gap.records import log_of
 
 D = torch.float64

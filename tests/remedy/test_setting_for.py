@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 import avtorch
-from avtorch.blindtest import draw_case
 from avtorch.remedy import setting_for, write_exports
+from benchmarks.blindtest import draw_case
 
 
 @pytest.mark.slow

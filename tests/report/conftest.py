@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 import avtorch
-from avtorch.blindtest import draw_case
 from avtorch.experiment import Experiment, Information, library
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.remedy import setting_for
+from benchmarks.blindtest import draw_case
 from tests.report.in_chromium import PROGRAM
 
 HOSTILE = '<script>alert(1)</script>"&{{ 7 * 7 }}.csv'

@@ -258,12 +258,12 @@ class Diagnosis(Displayed):
         } | ({} if self.tested is None else {"simulator": self.tested.to_dict()})
 
     def write(self, folder: str | PathLike[str]) -> list[Path]:
-        """Publish `diagnosis.json` and, where there is a plant, `plant.toml` at the same moment; returns the files.
+        """Write `diagnosis.json` and, where there is a plant, `plant.toml`; returns the files.
 
         The plant's effects act from the start, even where the log has an onset; a comment in `plant.toml` then states
         this (an effect with an onset of its own has it among its parameters). Another names the random effects. All
-        files of an earlier diagnosis in the folder are removed at the same moment, including its page, exports and
-        manoeuvre: write these afterwards, or all of them within one `avtorch.io.answer_set(folder, DIAGNOSIS_FILES)`.
+        files of an earlier diagnosis in the folder are removed, including its page, exports and manoeuvre: write these
+        afterwards, or all of them within one `avtorch.io.answer_set(folder, DIAGNOSIS_FILES)`.
         Raises `InputError` where the folder cannot be written or a number is not finite; the earlier diagnosis is then
         kept.
         """

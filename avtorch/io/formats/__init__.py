@@ -6,7 +6,6 @@ opened. ``avtorch[logs]`` brings all of them.
 
 from __future__ import annotations
 
-import importlib
 import os
 from collections.abc import Sequence
 
@@ -27,8 +26,7 @@ def open_recording(path: str | os.PathLike[str], *, dbc: Sequence[str | os.PathL
     only one in its folder. Other formats take none. Names are listed and no samples are read, except where a format
     has to be read to be listed (MAT before 7.3, Excel).
 
-    All but CAN logs are read in a process of their own, which a damaged file may end or fill; it lives as long as the
-    recording.
+    Each is read in a process of its own, which a damaged file may end or fill; it lives as long as the recording.
 
     Raises InputError naming the file: for what is no regular file or no recording, for a damaged one, for one whose
     library is not installed (with the command that installs it), and for a CAN log without a database.
@@ -40,10 +38,7 @@ def open_recording(path: str | os.PathLike[str], *, dbc: Sequence[str | os.PathL
     if dbc is not None and kind.reader != "can":
         raise InputError(f"{place(path)}: is {kind.words}, which no DBC decodes; dbc is for CAN logs")
     refuse_missing(place(path), kind)
-    if kind.apart:
-        return open_apart(path, kind)
-    reader = importlib.import_module(f"avtorch.io.formats.{kind.reader}")
-    return reader.open_can(path, kind, dbc) if kind.reader == "can" else reader.open_file(path, kind)
+    return open_apart(path, kind, dbc)
 
 
 def is_recording(path: str | os.PathLike[str]) -> bool:

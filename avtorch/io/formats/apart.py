@@ -1,9 +1,8 @@
-"""A reader in a process of its own, for formats whose libraries a damaged file can end or corrupt.
+"""A reader in a process of its own, with limits of memory and time: its library trusts what a file says of itself.
 
-asammdf, SciPy's reader of MAT and python-calamine are compiled code that trusts a file's sizes: damage has been seen to
-end the process (segmentation faults, 400 GB claimed by two cells). A bag's compressed pieces inflate to whatever they
-hold. What ends there is one InputError here. The process lives as long as its recording, so a second reading starts at
-once.
+Damage has been seen to end the process (segmentation faults, 400 GB claimed by two cells), to fill its memory (pieces
+that inflate without end) and to hold it for ever (a chain of blocks that returns to itself). What ends there is one
+InputError here. The process lives as long as its recording, so a second reading starts at once.
 """
 
 from __future__ import annotations
@@ -15,7 +14,9 @@ import subprocess
 import sys
 import threading
 import weakref
+from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,8 +28,8 @@ from avtorch.io.formats.listed import Listed
 from avtorch.io.opening import place
 from avtorch.io.recording import Channel
 
-MOST_SECONDS = 300.0
-"""For opening, and for each reading: a workbook of 20 million cells takes about a tenth of that."""
+MOST_SECONDS, SECONDS_PER_MIB = 60.0, 1.0
+"""For opening, and for each reading, by the size of the file: a workbook of 20 million cells takes a third of that."""
 
 
 class ApartRecording(Listed):
@@ -45,10 +46,12 @@ class ApartRecording(Listed):
         return {name: Channel(name, clocks[k], self._child.numbers(len(clocks[k]))) for name, k in answer["channels"]}
 
 
-def open_apart(path: str | os.PathLike[str], kind: Kind) -> ApartRecording:
-    """Open a recording in a process of its own. Raises InputError, also where that process ends or is not done within
-    300 s."""
-    child = _Child(path, kind)
+def open_apart(
+    path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None = None
+) -> ApartRecording:
+    """Open a recording in a process of its own; `dbc`: the databases of a CAN log. Raises InputError, also where that
+    process ends or takes too long."""
+    child = _Child(path, kind, dbc)
     try:
         return ApartRecording(child, child.answer())
     except BaseException:
@@ -59,8 +62,9 @@ def open_apart(path: str | os.PathLike[str], kind: Kind) -> ApartRecording:
 class _Child:
     """The other process: requests are lines of JSON, answers are a line of JSON and the numbers it tells of."""
 
-    def __init__(self, path: str | os.PathLike[str], kind: Kind) -> None:
+    def __init__(self, path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None) -> None:
         self.source, self._words = place(path), kind.words
+        self._seconds = MOST_SECONDS + SECONDS_PER_MIB * _size(path) / 2**20
         # -P: nothing of the folder that the user happens to work in
         command = [sys.executable or "python", "-P", "-W", "ignore", "-m", "avtorch.io.formats.apart_process"]
         # a trace of a panic, which nobody sees, takes most of a second
@@ -68,7 +72,12 @@ class _Child:
         environment["PYTHONPATH"] = os.pathsep.join(part for part in sys.path if part)
         try:
             self._process = subprocess.Popen(
-                [*command, kind.words, os.fspath(path)],
+                [
+                    *command,
+                    kind.words,
+                    os.fspath(path),
+                    *([] if dbc is None else ["--dbc", *(os.fspath(base) for base in dbc)]),
+                ],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -109,7 +118,7 @@ class _Child:
             self._late = True
             self._process.kill()
 
-        timer = threading.Timer(MOST_SECONDS, end)
+        timer = threading.Timer(self._seconds, end)
         timer.daemon = True
         timer.start()
         try:
@@ -119,7 +128,9 @@ class _Child:
 
     def _ended(self) -> InputError:
         if self._late:
-            return InputError(f"{self.source}: is not read within {MOST_SECONDS:g} s; a smaller file is needed")
+            return InputError(
+                f"{self.source}: is not read within {self._seconds:.3g} s; a smaller or an undamaged file is needed"
+            )
         self._process.kill()
         code = self._process.wait()
         how = f"status {code}"
@@ -138,3 +149,12 @@ class _Child:
             if stream is not None:
                 with suppress(OSError):  # a request that nobody will read
                     stream.close()
+
+
+def _size(path: str | os.PathLike[str]) -> int:
+    """Bytes of a file, or of all files of a folder."""
+    here = Path(path)
+    try:
+        return sum(file.stat().st_size for file in (here.iterdir() if here.is_dir() else (here,)))
+    except (OSError, ValueError):  # its reader says so
+        return 0

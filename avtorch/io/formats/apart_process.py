@@ -1,7 +1,7 @@
 """The process in which a reader runs apart: opens one recording, then answers requests for its channels.
 
-Arguments are the name of the format and the path. Each request is a line of JSON, the names; each answer is a line of
-JSON, then the numbers: the clocks, then the values of the channels.
+Arguments are the name of the format, the path, and the databases of a CAN log. Each request is a line of JSON, the
+names; each answer is a line of JSON, then the numbers: the clocks, then the values of the channels.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ def main() -> None:
     kind = kinds.named(sys.argv[1])
     try:
         reader = importlib.import_module(f"avtorch.io.formats.{kind.reader}")
-        recording: Recording = reader.open_file(sys.argv[2], kind)
+        given = {"dbc": sys.argv[4:]} if sys.argv[3:4] == ["--dbc"] else {}
+        recording: Recording = reader.open_file(sys.argv[2], kind, **given)
     except InputError as fault:
         answer(out, {"error": str(fault)})
         return

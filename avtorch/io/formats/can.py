@@ -13,7 +13,6 @@ import numpy as np
 
 from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats import kinds
-from avtorch.io.formats.blf_objects import sound_part
 from avtorch.io.formats.can_database import Decoded, databases_of, messages_of
 from avtorch.io.formats.kinds import Kind
 from avtorch.io.formats.library import guarded, library, reason, silenced
@@ -140,8 +139,10 @@ class _Frames:
             try:
                 frame = next(frames, None)
             except Exception as fault:
-                if number and not stream.read(1):
-                    self.remarks.append(f"the log is cut off after frame {number}")
+                at_end = not stream.read(1)
+                if number and (at_end or self._kind is kinds.BLF):
+                    what = "cut off" if at_end else "damaged and no further read"
+                    self.remarks.append(f"the log is {what} after frame {number}")
                     return
                 raise InputError(
                     f"{self._source}: frame {number + 1} cannot be read ({reason(fault)}); {_NEED} is needed"
@@ -156,10 +157,7 @@ class _Frames:
         can = library("can.io", self._source, self._kind)
         raw = read_regular(self._path, most=MOST_BYTES, need=_NEED)
         if self._kind is kinds.BLF:
-            end, fault = sound_part(raw, self._source)
-            if fault is not None and self._most is None:
-                self.remarks.append(f"the log is read up to where it is damaged: {fault}")
-            stream = io.BytesIO(raw[:end])
+            stream = io.BytesIO(raw)
             return can.BLFReader(stream), stream
         end = raw.rfind(b"\n") + 1
         if raw[end:].strip():  # a number at the end may lack its last digits
@@ -170,7 +168,9 @@ class _Frames:
         return (can.ASCReader if self._kind is kinds.ASC else can.CanutilsLogReader)(text), text
 
 
-def open_can(path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None) -> CanRecording:
+def open_file(
+    path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None = None
+) -> CanRecording:
     """Open a CAN log with its databases; one pass over the log finds which messages it holds.
 
     Raises InputError for a log without a database or of another one, and for a damaged one; a log that is cut off is

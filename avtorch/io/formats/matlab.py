@@ -17,7 +17,6 @@ from avtorch.io.formats import kinds
 from avtorch.io.formats.kinds import Kind
 from avtorch.io.formats.library import guarded, library
 from avtorch.io.formats.listed import Listed, refuse_cells
-from avtorch.io.formats.mat_elements import check_elements
 from avtorch.io.formats.mat_tables import tables
 from avtorch.io.formats.mat_tree import TIMES, Found, Loaded, Matrix, Series, Tree, find_series, vector
 from avtorch.io.formats.opened import opened
@@ -89,8 +88,6 @@ def _open_5(path: str | os.PathLike[str]) -> MatRecording:
     raw = read_regular(path, most=MOST_BYTES, need=_NEED)
     if raw[126:128] not in (b"IM", b"MI"):
         raise InputError(f"{source}: byte 127: {raw[126:128]!r} where IM or MI should be; {_NEED} is needed")
-    if check_elements(raw, source):
-        raise InputError(f"{source}: is cut off within its last variable, at byte {len(raw):,}; {_NEED} is needed")
     import io
 
     from scipy.io import loadmat

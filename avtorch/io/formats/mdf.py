@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import weakref
 from collections import Counter
 from collections.abc import Mapping
@@ -15,7 +16,6 @@ from avtorch.errors import InputError, quoted
 from avtorch.io.formats.kinds import Kind
 from avtorch.io.formats.library import guarded, library
 from avtorch.io.formats.listed import Listed, refuse_cells
-from avtorch.io.formats.mdf_chains import walk
 from avtorch.io.formats.opened import beginning, in_memory, opened
 from avtorch.io.opening import place
 from avtorch.io.recording import Channel
@@ -28,6 +28,8 @@ _TIME, _NO_SYNC = 1, 0  # what a master counts in MDF 4; the others are an angle
 _MASTERS_4 = (2, 3)
 _VARIABLE_LENGTH = 1
 _DATES_3 = (132, 133)
+_INCOMPLETE = re.compile(r"Incomplete block at 0x([0-9a-f]+)")
+_MOST_CUT = 100  # blocks that the end of a file may cut: one of each group, where they lie behind each other
 
 
 class MdfRecording(Listed):
@@ -87,17 +89,17 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> MdfRecording:
     stream = in_memory(path, most=MOST_BYTES, need=_NEED) if unfinished else opened(path, need=_NEED)
     try:
         with guarded(source, _NEED):
-            chains = walk(stream, source)
-            if chains.cut:
+            try:
+                mdf = _loaded(asammdf, stream, whole=True)
+            except asammdf.blocks.utils.MdfException as fault:
+                if _INCOMPLETE.search(str(fault)) is None:
+                    raise
                 stream.close()
                 stream = in_memory(path, most=MOST_BYTES, need=_NEED)
-                _end_here(stream, chains.cut)
-            stream.seek(0)
-            mdf = _loaded(asammdf, stream)
+                mdf = _cut_off(asammdf, stream, fault)
+                remarks.append("the file is cut off; what its end cuts is read as far as it goes, or left out")
             if unfinished:
                 remarks.append("the recorder did not finish the file; it was completed as far as it goes")
-            if chains.beyond:
-                remarks.append(f"the file is cut off: {chains.beyond} of its blocks lie behind its end, or end there")
             listing = _Listing(mdf)
         recording = MdfRecording(
             source, f"MDF {mdf.version}", mdf, listing.places, listing.units, remarks + listing.remarks
@@ -109,18 +111,35 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> MdfRecording:
         raise
 
 
-def _end_here(stream: BinaryIO, cut: Mapping[int, int]) -> None:
-    """Blocks of samples that the end of the file cuts end there: asammdf leaves out those that claim more."""
-    for at, left in cut.items():
+def _cut_off(asammdf: Any, stream: BinaryIO, fault: Exception) -> Any:
+    """A file that ends within the blocks that asammdf names: blocks of samples end there, others are left out."""
+    for _ in range(_MOST_CUT):
+        told = _INCOMPLETE.search(str(fault))
+        if told is None:
+            raise fault
+        at = int(told[1], 16)
+        end = stream.seek(0, 2)
+        stream.seek(at)
+        if stream.read(4) != b"##DT":
+            break
         stream.seek(at + 8)
-        stream.write(left.to_bytes(8, "little"))
+        stream.write((end - at).to_bytes(8, "little"))
+        try:
+            return _loaded(asammdf, stream, whole=True)
+        except asammdf.blocks.utils.MdfException as next_fault:
+            fault = next_fault
+    return _loaded(asammdf, stream, whole=False)
 
 
-def _loaded(asammdf: Any, stream: BinaryIO) -> Any:
-    """The file, incomplete blocks left out. What asammdf has built when it fails is closed, or it complains later."""
+def _loaded(asammdf: Any, stream: BinaryIO, *, whole: bool) -> Any:
+    """The file; `whole`: blocks that its end cuts are an error, and left out else.
+
+    What asammdf has built when it fails is closed, or it complains later.
+    """
     option = "raise_on_incomplete_blocks"
     before = asammdf.get_global_option(option)
-    asammdf.set_global_option(option, False)
+    asammdf.set_global_option(option, whole)
+    stream.seek(0)
     try:
         return asammdf.MDF(stream, process_bus_logging=False)
     except Exception as fault:

@@ -14,8 +14,6 @@ import numpy as np
 import pytest
 
 from avtorch import diagnose
-from avtorch.blindtest import Car, simulate
-from avtorch.blindtest.drives import Recorded
 from avtorch.errors import InputError
 from avtorch.gap import DeadTime, DrivelineOscillation, GainChange, SensorBias
 from avtorch.gap.engine.coordinates import EFFECTS
@@ -26,6 +24,8 @@ from avtorch.gap.engine.search import promises
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.effect import Effect
 from avtorch.io import Log
+from benchmarks.blindtest import Car, simulate
+from benchmarks.blindtest.drives import Recorded
 from tests.bars import BAR
 from tests.gap.cars import log_of
 from tests.gap.engine.recorded import fitted_hypothesis, recorded_log

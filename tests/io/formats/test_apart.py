@@ -88,7 +88,7 @@ def test_a_process_that_ends_between_two_readings(tmp_path: Path) -> None:
 
 def test_a_process_that_takes_too_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(apart, "MOST_SECONDS", 0.001)
-    with pytest.raises(InputError, match=r"is not read within 0.001 s; a smaller file is needed"):
+    with pytest.raises(InputError, match=r"is not read within .* s; a smaller or an undamaged file is needed"):
         open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
 
 

@@ -1,0 +1,130 @@
+"""The reference vehicle: GLVD exactly without a cause, and every cause follows its equation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from avtorch.errors import InputError
+from benchmarks.blindtest.car import Car
+from benchmarks.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, family
+from benchmarks.blindtest.drives import MANOEUVRES, DrivePlan, Recorded
+from benchmarks.blindtest.vehicle import Run, simulate
+from tests.bars import BAR
+
+CAR = Car(T_L=0.37, K_L=0.93).silent()
+RATE = 50
+
+
+def glvd(command: np.ndarray, dt: float = 1 / RATE, T_L: float = CAR.T_L, K_L: float = CAR.K_L) -> np.ndarray:
+    """Closed form: a[k+1] = alpha a[k] + K (1 - alpha) u[k], from rest."""
+    alpha = np.exp(-dt / T_L)
+    return np.asarray(lfilter([0.0, K_L * (1 - alpha)], [1.0, -alpha], command))
+
+
+def command(seconds: float = 20.0, rate: int = RATE) -> np.ndarray:
+    """Steps and a wave, small enough that the car never stops."""
+    t = np.arange(round(seconds * rate)) / rate
+    return 0.8 * np.sin(1.3 * t) + np.where((t % 4) < 2, 0.7, -0.7)
+
+
+def drive(effects: dict[str, dict[str, float]] | None = None, *, car: Car = CAR, onset: float = 0.0, **more) -> Run:
+    u = more.pop("u", command())
+    pilot = Recorded(u, start_speed=more.pop("start_speed", 20.0))
+    return simulate(car, pilot, seconds=len(u) / RATE, rate_hz=RATE, effects=effects, onset=onset, **more)
+
+
+@pytest.mark.parametrize("manoeuvre", MANOEUVRES)
+@pytest.mark.parametrize("rate", [20, 100])
+def test_without_effects_and_noise_it_is_the_closed_form(manoeuvre: str, rate: int) -> None:
+    made = DrivePlan(manoeuvre, 60.0, rate, 4)  # type: ignore[arg-type]
+    run = simulate(CAR, made.pilot(), seconds=60.0, rate_hz=rate)
+    moving = run.true_speed > 0.3
+    assert moving.mean() > 0.5
+    np.testing.assert_allclose(run.accel[moving], glvd(run.command, 1 / rate)[moving], atol=1e-6, rtol=0)
+
+
+def test_speed_and_position_are_the_integrals() -> None:
+    u = command()
+    run = drive(u=u)
+    a, dt = glvd(u), 1 / RATE
+    # the integral of T da/dt = K u - a over the drive
+    speed = 20.0 + CAR.K_L * np.concatenate([[0.0], np.cumsum(u)[:-1]]) * dt - CAR.T_L * a
+    np.testing.assert_allclose(run.speed, speed, atol=1e-5, rtol=0)
+    simpson = np.concatenate([[0.0], np.cumsum(0.5 * dt * (speed[1:] + speed[:-1]) - dt**2 / 12 * np.diff(a))])
+    np.testing.assert_allclose(run.position, simpson, atol=1e-4, rtol=0)
+
+
+def test_noise_of_the_car_is_superposed_and_reported() -> None:
+    run = drive(car=Car(T_L=CAR.T_L, K_L=CAR.K_L, process_sd=0.1, accel_sd=0.1, speed_sd=0.05, speed_quantum=0.02))
+    np.testing.assert_allclose(run.accel - run.noise_accel, glvd(run.command), atol=1e-6, rtol=0)
+    clean = drive().speed
+    np.testing.assert_allclose(run.speed - run.noise_speed - run.drift_speed, clean, atol=1e-5, rtol=0)
+    np.testing.assert_allclose(run.speed / 0.02, np.round(run.speed / 0.02), atol=1e-6)
+
+
+@pytest.mark.statistical
+def test_noise_has_the_size_and_memory_stated(rotating_seed: int) -> None:
+    car = Car(T_L=0.3, process_sd=0.08, accel_sd=0.0, speed_sd=0.04)
+    run = drive(car=car, u=np.zeros(60 * RATE), seed=rotating_seed)
+    n = run.noise_accel
+    # an OU process over 60 s with a memory of 0.3 s: about 100 samples' worth, the SD within 5 times 7 %
+    assert n.std() == pytest.approx(0.08, rel=0.35)
+    lag = np.mean(n[:-15] * n[15:]) / np.mean(n**2)
+    assert lag == pytest.approx(np.exp(-1), abs=0.45)
+    assert run.noise_speed.std() == pytest.approx(0.04, rel=BAR / np.sqrt(2 * len(n)))
+
+
+def test_same_seed_same_log_and_another_seed_another() -> None:
+    car, effects = Car(), {"gust": {"sd_mps2": 0.2, "time_constant_s": 2.0}, "command_hold": {"hold_fraction": 0.2}}
+    one, two, other = (drive(effects, car=car, seed=s) for s in (5, 5, 6))
+    for name in vars(one):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    assert np.abs(one.accel - other.accel).max() > 0.01
+    np.testing.assert_array_equal(drive(car=car, seed=5).noise_accel, one.noise_accel)
+
+
+@pytest.mark.parametrize("name", [*EFFECTS, *CALIBRATION, *SEALED])
+def test_every_cause_vanishes_with_its_strength_and_shows_at_full(name: str) -> None:
+    made = DrivePlan("stop_and_go" if name == "low_speed_creep" else "steps", 30.0, RATE, 8)
+    draw = family(name).draw(np.random.default_rng(1), CAR, made)
+    far: list[float] = []
+    for strength in (1e-4, family(name).strongest):
+        run = simulate(
+            Car(CAR.T_L, CAR.K_L, 0.0, 0.05, 0.0),
+            made.pilot(),
+            seconds=30.0,
+            rate_hz=RATE,
+            effects={name: draw(strength)},
+        )
+        moving = run.true_speed > 0.3
+        error = (run.accel - run.noise_accel - glvd(run.command))[moving]
+        slip = (run.speed - run.noise_speed - run.true_speed)[moving]
+        far.append(float(np.sqrt(np.mean(error**2) + np.mean(slip**2))))
+    assert far[0] < 2e-3
+    assert far[1] > 0.02
+
+
+@pytest.mark.parametrize("name", [*EFFECTS, *CALIBRATION, *SEALED])
+def test_before_its_onset_no_cause_leaves_a_trace(name: str) -> None:
+    draw = family(name).draw(np.random.default_rng(1), CAR, DrivePlan("steps", 20.0, RATE, 1))
+    parameters = draw(min(2.0, family(name).strongest))
+    if name == "gain_change":
+        parameters["change_s"] = 10.0
+    late = drive({name: parameters}, car=Car(), onset=10.0)
+    plain = drive(car=Car())
+    early = late.time < 10.0 - 1e-9
+    np.testing.assert_allclose(late.accel[early], plain.accel[early], atol=1e-9, rtol=0)
+    np.testing.assert_allclose(late.speed[early], plain.speed[early], atol=1e-9, rtol=0)
+
+
+def test_bad_arguments_are_named() -> None:
+    with pytest.raises(InputError, match="rate_hz"):
+        simulate(CAR, Recorded(np.zeros(9), start_speed=9.0), seconds=1.0, rate_hz=30)
+    with pytest.raises(InputError, match="onset"):
+        drive(onset=99.0)
+    with pytest.raises(InputError, match="T_L"):
+        Car(T_L=0.0)
+    with pytest.raises(InputError, match="effect"):
+        family("ghost")
