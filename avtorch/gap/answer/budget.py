@@ -112,7 +112,8 @@ class Unexplained:
     `material`: surely more than a user cares for; `probability`: that it is more. Where it is material, `where` holds
     the parts of the drive that it lies in, if any in particular, and `resembles` the effect that promises to explain
     much of it but is not certain enough to be named. `still`: the share of the squared error left that a black box
-    takes off on blocks that taught neither, from what it surely does to what the log could have shown.
+    takes off on blocks that taught neither, from what it surely does to what the log could have shown. `carried`: what
+    of the gap a force without a name takes off, which the repaired simulator carries; a part of `share`.
 
     Example:
         >>> from avtorch.gap import Unexplained
@@ -127,6 +128,7 @@ class Unexplained:
     where: tuple[Location, ...] = ()
     resembles: str | None = None
     still: Quantity | None = None
+    carried: Quantity | None = None
 
     def rest(self, material: float) -> str:
         """What the error that is left is, in words: noise only where no black box could take off what matters."""
@@ -149,6 +151,7 @@ class Unexplained:
             "where": [part.to_dict() for part in self.where],
             "resembles": self.resembles,
             "still": None if self.still is None else _interval(self.still),
+            "carried": None if self.carried is None else _interval(self.carried),
         }
 
 
@@ -236,7 +239,7 @@ class Budget:
         """What a person reads first."""
         if not self.names:
             if self.unexplained.material:
-                return "No known effect explains the gap."
+                return f"No known effect explains the gap{self._by_the_plant(', but ')}."
             rest = self.unexplained.rest(self.material)
             return (
                 "Nothing material is missing."
@@ -259,14 +262,27 @@ class Budget:
         lines = [lead or f"Chiefly {', then '.join(words)}"] if words else []
         if small:
             lines.append(f"{listing(small)} with under {percent(self.material)}{' each' if small[1:] else ''}")
-        if self.unexplained.share.mean >= 0.005 and named:
-            lines.append(f"{percent(self.unexplained.share.mean)} is reproducible and no known effect explains it")
+        rest = self.unexplained.share.mean
+        if rest >= 0.005 and named:
+            plant = self._by_the_plant(": ")
+            if rest > max(p.share.mean for p in named) and not lead:
+                lines[0] = lines[0].replace("Chiefly ", "", 1)
+                lines.insert(0, f"chiefly no known effect explains it ({percent(rest)} of the gap{plant})")
+            else:
+                lines.append(f"{percent(rest)} is reproducible and no known effect explains it{plant}")
         by_chance = [_words(c) for c in self.chance if c.probability >= LIKELY]
         noise = self.unexplained.rest(self.material)
         noise = noise if not by_chance else f"{noise}, in part this: {' and '.join(by_chance)}"
         lines.append(f"the rest of the error is {noise}")
         text = "; ".join(lines) + "."
         return text[0].upper() + text[1:]
+
+    def _by_the_plant(self, before: str) -> str:
+        """What of the gap the repaired simulator takes off without a name; empty where that is nothing."""
+        carried = self.unexplained.carried
+        if carried is None or carried.mean < 0.005:
+            return ""
+        return f"{before}a force without a name in the repaired simulator takes off {percent(carried.mean)}"
 
     def to_dict(self) -> dict[str, Any]:
         """The object `budget` of `diagnosis.json`."""

@@ -80,6 +80,7 @@ def budget_of(
             )
         )
     named_parts = {p.name for p in parts}
+    carried = _quantity(shares["free form"]) if "free form" in shares else None
     for name, share in shares.items():  # what the hypothesis holds and the label does not name
         if name not in named_parts:
             rest = rest + share
@@ -102,7 +103,11 @@ def budget_of(
         by_channel=by_channel,
         parts=tuple(parts),
         unexplained=Unexplained(
-            unnamed, matters, average.probabilities["unknown"] if not parts else beyond, still=_still(held, seed)
+            unnamed,
+            matters,
+            average.probabilities["unknown"] if not parts else beyond,
+            still=_still(held, seed),
+            carried=carried,
         ),
         baseline={key: held.chain[0][key] for key in ("T_L", "K_L")},
         repaired=posterior.moved(),

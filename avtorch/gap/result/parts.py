@@ -114,10 +114,10 @@ def said_of_unnamed(parts: Sequence[AnswerPart]) -> str:
         return ""
     if part.size_mps2 is None:
         return f"A part without a name is {FORMS[str(part.form)][1]} (probability {part.probability:.2g})."
-    of = "speed" if part.form == "R(v)" else "command and speed"
+    of = "the speed has" if part.form == "R(v)" else "command and speed have"
     return (
         f"A part without a name is the force map {part.form}: the car's force differs from K u by "
-        f"{part.size_mps2.mean:.2g} m/s² as {of} have it (probability {part.probability:.2g})."
+        f"{part.size_mps2.mean:.2g} m/s² as {of} it (probability {part.probability:.2g})."
     )
 
 
