@@ -6,8 +6,7 @@ Draws the cases of a cell, lets the function answer those that it has not answer
 A cell is a name; it and the tier give the seed. Each tier is a set of its own, drawn by `blindtest.draw_case`
 in the blind test's mix (25 % none, 40 % single, 20 % pair, 15 % outside, exact in every 20 cases) with its single and
 outside causes of that tier; none and pair have no tier. 40 cases of a set are 10 none, 16 single, 8 pair and 6
-outside: the sixths among the outside causes, and 60 cars without a cause in three tiers behind two recorders, are those
-of the table in ENGINE.md. Behind either recorder the drives are the same (but for stops), so that every case has its
+outside. Behind either recorder the drives are the same (but for stops), so that every case has its
 twin.
 
 `FUNCTION` takes an `avtorch.Log`, or with `--csv` the path of the log, and returns an `avtorch.Diagnosis` or a dict of
@@ -20,8 +19,7 @@ goes on where the first ended; several calls may share a folder. After a change 
 Causes outside the table are those that may serve to calibrate `unknown`. The sealed ones (`--outside sealed`) are for
 the last figures, on a cell that nobody has looked at.
 
-The columns: `top-1`, share of all cases whose verdict is exactly the truth (as ENGINE.md counts; 90 % interval by
-Wilson), also by kind; `AUROC` of the probability of `unknown`; `blamed`: outside causes for which a name has
+The columns: `top-1`, share of all cases whose verdict is exactly the truth (90 % interval by Wilson), also by kind; `AUROC` of the probability of `unknown`; `blamed`: outside causes for which a name has
 probability 0.5 or more; `accused`: cars without a cause whose verdict is not `none`; `ECE`, and what it would be by
 chance were all probabilities right; wall and processor seconds an answer; `onset`: median error [s] where the verdict
 is right. A method that fails has answered wrongly.

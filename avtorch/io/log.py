@@ -33,7 +33,9 @@ from avtorch.io.validity import check_units
 if TYPE_CHECKING:
     import pandas
 
-STANDSTILL_MPS, STANDSTILL_SHARE = 0.3, 0.1
+STANDSTILL_SHARE = 0.1
+"""Of its own top speed [-], below which what never goes fast stands (`Log.standstill_mps`)."""
+STANDSTILL_MPS = 0.3
 """Below this speed [m/s] GLVD does not hold; such rows are masked. What never goes ten times as fast, a small robot,
 stands below a tenth of its own top speed (`Log.standstill_mps`).
 
@@ -284,7 +286,7 @@ class Log(Displayed):
         """Rows not at standstill, ``(time,)``; without speed, detected from the response to the brake
         (``standing``)."""
         if self.speed is not None:
-            return self.speed >= self.standstill_mps
+            return (self.speed >= self.standstill_mps) & (self.speed > 0)
         moving = np.ones(self.rows, bool)
         if self.accel is None or self.accel_cmd is None:  # pedals alone do not tell a car at rest from one at speed
             return moving

@@ -258,8 +258,9 @@ def require_usable(log: Log) -> None:
         raise InputError(
             f"{log.name}: has no row to use; all are driven by hand (engaged 0), within 2 s after, or at standstill"
         )
-    longest = max(log.elapsed[p.stop - 1] - log.elapsed[p.start] for p in stretches(log.usable, log.segment))
-    if longest < LEAST_S:
+    spans = [log.elapsed[p.stop - 1] - log.elapsed[p.start] for p in stretches(log.usable, log.segment)]
+    longest = max(spans) + 1 / log.rate_hz  # a row lasts until the next one
+    if longest < LEAST_S - 1e-6:
         still = f"; {float((~log.moving).mean()):.0%} of the rows are below {log.standstill_mps:.2g} m/s"
         raise InputError(
             f"{log.name}: too little is left to use: the longest stretch lasts {longest:.2g} s, needs {LEAST_S:g} s or "

@@ -130,6 +130,7 @@ def test_files_and_words(
     assert [log.name for log in call.pop("logs")] == [drive, other]
     assert call == {
         "material": 0.03,
+        "named_only": False,
         "baseline": None,
         "prior": None,
         "accel_kind": "kinematic",

@@ -101,7 +101,7 @@ def test_a_broken_log_is_a_row_that_says_why_and_the_others_are_done(tmp_path: P
             "black": "failed",
         }
         assert "drive.csv" in rows["green"]["error"]
-        assert "accel_cmd" in rows["green"]["error"] or "rows" in rows["green"]["error"]
+        assert "accel_cmd" in rows["green"]["error"] or "from row to row" in rows["green"]["error"]
 
 
 def test_a_second_call_computes_nothing(tmp_path: Path, scheduler: str, computed: list[tuple[str, str]]) -> None:

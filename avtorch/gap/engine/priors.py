@@ -53,7 +53,7 @@ FAINT_MAP = 0.05
 effect does; a car with a true command is linear to some per cent."""
 
 RECORDER_DELAY_S = {"accel": (0.0, 0.0075), "speed": (0.01, 0.01)}
-"""Mean and standard deviation of a recorder's delay [s]: buses, clocks of channels (REALITY: up to 20 ms)."""
+"""Mean and standard deviation of a recorder's delay [s]: buses and clocks of channels, up to 20 ms."""
 RECORDER_FILTER_S = {"accel": (0.015, 0.0125), "speed": (0.03, 0.0175)}
 """Mean and standard deviation of its one-pole filter [s]; 20 to 80 ms are usual."""
 

@@ -30,7 +30,7 @@ CHANCE = ("gust", "outliers", "command_hold")
 """Causes that chance decides: no free run foretells them."""
 _RESAMPLES = 400
 _NOTHING = 1e-3  # of the energy before, below which free runs show no gap
-_NO_GAP = 0.1  # share of the error before that is within the floor: nothing to close (DIAGNOSIS)
+_NO_GAP = 0.1  # share of the error before that is within the floor: nothing to close
 
 
 def budget_of(

@@ -41,10 +41,11 @@ def _knots(name: str, unit: str) -> Domain:
 
 @dataclass(frozen=True)
 class ForceTable(Effect):
-    """`force_mps2` [m/s²] beyond K_L u, a row for each command of `command_mps2`, a column for each speed of
-    `speed_mps`; linear between them and held outside, so that the car has the gain K_L there.
+    """A force beyond K_L u that is a table over command and speed.
 
-    It acts through the actuator's lag, on the command as it arrives and at the speed of that moment.
+    `force_mps2` [m/s²] has a row for each command of `command_mps2`, a column for each speed of `speed_mps`; linear
+    between them and held outside, so that the car has the gain K_L there. It acts through the actuator's lag, on the
+    command as it arrives and at the speed of that moment. Raises `InputError` where shapes differ.
 
     Example:
         >>> from avtorch.gap import ForceTable, plant
@@ -96,7 +97,10 @@ class ForceTable(Effect):
 
 @dataclass(frozen=True)
 class ResistanceCurve(Effect):
-    """`force_mps2` [m/s²] at the speeds `speed_mps` [m/s], linear between them and held outside, while the car moves.
+    """A force that is a curve over the speed, while the car moves.
+
+    `force_mps2` [m/s²] at the speeds `speed_mps` [m/s], linear between them and held outside. Raises `InputError` where
+    lengths differ.
 
     Example:
         >>> import torch

@@ -277,7 +277,6 @@ def test_process_noise_behind_a_sensor_that_lags_is_no_gust(rotating_seed: int) 
     assert slow_forces(data, residual, NEUTRAL).gust > 20  # a sensor that is taken for a good one
 
 
-@pytest.mark.statistical
 @pytest.mark.parametrize(("lag_s", "scale"), [(0.0, 0.0), (0.6, 0.0), (2.5, 0.3)])
 def test_nothing_explains_a_covariance_better_than_itself(lag_s: float, scale: float, fresh_seed: int) -> None:
     """Also where an accelerometer's lag and scale are undone: hypotheses with other lags are compared."""
@@ -291,6 +290,7 @@ def test_nothing_explains_a_covariance_better_than_itself(lag_s: float, scale: f
     assert found.log_likelihood + max(found.gust, found.road) < itself
 
 
+@pytest.mark.statistical
 def test_the_size_of_process_noise_is_not_rounded_to_a_grid(rotating_seed: int) -> None:
     """Halfway between two points of the grid: a power so far off would pass for a gust in a long drive."""
     q = float(np.sqrt(PROCESS_NOISE_GRID[13] * PROCESS_NOISE_GRID[14]))
