@@ -19,10 +19,11 @@ goes on where the first ended; several calls may share a folder. After a change 
 Causes outside the table are those that may serve to calibrate `unknown`. The sealed ones (`--outside sealed`) are for
 the last figures, on a cell that nobody has looked at.
 
-The columns: `top-1`, share of all cases whose verdict is exactly the truth (90 % interval by Wilson), also by kind; `AUROC` of the probability of `unknown`; `blamed`: outside causes for which a name has
-probability 0.5 or more; `accused`: cars without a cause whose verdict is not `none`; `ECE`, and what it would be by
-chance were all probabilities right; wall and processor seconds an answer; `onset`: median error [s] where the verdict
-is right. A method that fails has answered wrongly.
+The columns: `top-1`, share of all cases whose verdict is exactly the truth (90 % interval by Wilson), also by kind;
+`AUROC` of the probability of `unknown`; `blamed`: outside causes for which a name has probability 0.5 or more;
+`accused`: cars without a cause whose verdict is not `none`; `ECE`, and what it would be by chance were all
+probabilities right; wall and processor seconds an answer; `onset`: median error [s] where the verdict is right. A
+method that fails has answered wrongly.
 """
 
 from __future__ import annotations
