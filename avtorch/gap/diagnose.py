@@ -173,6 +173,12 @@ def diagnose(
         told("held-out blocks", 0, 1)
     found = None if named_only else fitted_form(repaired.examined.hypothesis, base, none)
     free = found if found is not None and found.earns_its_place else None
+    held = None
+    if Blocks.of(inference.data) is not None:
+        visited = [h for h in inference.search.visited.values() if h.force is None]
+        held = held_out_errors(nested(none, repaired.examined.hypothesis, visited), free)
+        if held is not None and free is not None and not held.free_gains:
+            free, held = None, held.without_free()
     lag_and_gain, assumed = base_quantities(none, seed)
     bare = _base_weight(inference)
     simulator = ParameterPosterior(bare).plant(base, bare.process_noise)
@@ -184,10 +190,6 @@ def diagnose(
         ratio = {"T_L": float(back.T_L) / float(car.T_L), "K_L": float(back.K_L) / float(car.K_L)}
         belief = {key: x * ratio.get(key, 1.0) for key, x in belief.items()}
         moved = {key: Quantity(*(ratio[key] * x for x in (q.mean, q.sd, q.q05, q.q95))) for key, q in moved.items()}
-    held = None
-    if Blocks.of(inference.data) is not None:
-        visited = [h for h in inference.search.visited.values() if h.force is None]
-        held = held_out_errors(nested(none, repaired.examined.hypothesis, visited), free)
     budget = None
     if held is not None:
         budget = budget_of(
