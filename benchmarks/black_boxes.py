@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
-from avtorch.gap import GapPlant
+from avtorch.gap import GapPlant, plant
 
 _SMOOTH_S = 0.15  # of a speed before it is differenced
 _SETTLED_S = 2.0  # of a stretch, after which filters know their past
@@ -69,10 +69,11 @@ def free_run(model: Driven, part: Stretch, warm: int, dt: float) -> FloatArray:
 
 
 class PlantDriven:
-    """A plant of the project."""
+    """A plant of the project, without what it draws by chance: of that only the mean, nothing, can be foretold."""
 
-    def __init__(self, plant: GapPlant, dt: float) -> None:
-        self.plant, self.dt = plant, dt
+    def __init__(self, car: GapPlant, dt: float) -> None:
+        sure = [e for e in car.effects if not e.random]
+        self.plant, self.dt = plant(sure, T_L=float(car.T_L), K_L=float(car.K_L), sigma=0.0), dt
 
     def start(self, u: float, v: float, a: float) -> None:
         self.plant.reset()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.result.free_form import FittedForm, Sizes, fitted_form
+from avtorch.gap.result.held_out import HeldOut, Scores
 from avtorch.gap.result.output_error import Coefficients, Runs
 from tests.gap.cars import log_of
 
@@ -70,3 +72,18 @@ def test_slopes_of_free_runs_are_their_derivatives() -> None:
 def test_a_table_costs_more_without_a_resistance() -> None:
     assert Sizes(0.2, 0.2).nats < Sizes(0.0, 0.2).nats
     assert not Sizes(0.0, 0.0).any
+
+
+@pytest.mark.parametrize(
+    ("named", "free", "gains"), [(0.5, 0.3, True), (0.5, 0.6, False), (1.4, 1.2, False), (1.4, 0.9, True)]
+)
+def test_a_free_form_that_loses_in_the_budgets_runs_is_not_handed_back(named: float, free: float, gains: bool) -> None:
+    """Against names alone, and against the baseline; channels count alike, whatever their units."""
+    scale = np.array([[4.0, 4.0], [0.01, 0.03]])  # (channel, block)
+    steps = tuple(Scores(x * scale, np.zeros(2)) for x in (1.0, named, free))
+    held = HeldOut(
+        (), cast(Any, None), steps, steps[0], steps[1], steps[0], *np.zeros((4, 1)), horizon_s=10.0, free=True
+    )
+    assert held.free_gains == gains
+    assert [x.squares[0, 0] for x in held.without_free().steps] == [4.0, 4.0 * named]
+    assert not held.without_free().free
