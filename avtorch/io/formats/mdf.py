@@ -1,6 +1,7 @@
 """MDF 3 and 4 by asammdf: names from the blocks, samples of those channels that are asked for."""
 
-from __future__ import annotations
+from __future__ from contextlib import suppress
+import annotations
 
 import os
 import re
@@ -159,6 +160,7 @@ def _loaded(asammdf: Any, stream: BinaryIO, *, whole: bool) -> Any:
 
 def _close(mdf: Any, stream: BinaryIO) -> None:
     try:
+        with suppress(FileNotFoundError):  # its temporary file may have gone with another process
         mdf.close()
     finally:
         stream.close()
