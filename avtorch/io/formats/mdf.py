@@ -1,13 +1,13 @@
 """MDF 3 and 4 by asammdf: names from the blocks, samples of those channels that are asked for."""
 
-from __future__ from contextlib import suppress
-import annotations
+from __future__ import annotations
 
 import os
 import re
 import weakref
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -161,7 +161,7 @@ def _loaded(asammdf: Any, stream: BinaryIO, *, whole: bool) -> Any:
 def _close(mdf: Any, stream: BinaryIO) -> None:
     try:
         with suppress(FileNotFoundError):  # its temporary file may have gone with another process
-        mdf.close()
+            mdf.close()
     finally:
         stream.close()
 
