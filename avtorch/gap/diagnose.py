@@ -224,6 +224,9 @@ def diagnose(
     onset = first_onset(weight if named else top, names if named else top.label.split("+"), each)
     scope = _scope(inference, shown, data.channels, pairs)
     errors = [rows.errors(h) for h in (none, best, repaired.examined.hypothesis)]
+    after = errors[2] if named else errors[0]
+    if free is not None:
+        after = rows.errors(free.lagged, free.without([]))
     return Diagnosis(
         log=LogFacts.of(each),
         baseline=lag_and_gain,
@@ -249,7 +252,7 @@ def diagnose(
         else localise(attribution, onset_s=None if onset is None else onset.from_start_s, lag=none["T_L"]),
         shrinkage=shrinkage_of(held, seed) if held is not None and back is not None else None,
         contenders=predictive_models(posteriors, said, base),
-        traces=_traces(each, rows, errors[0], errors[2] if named else errors[0], attribution),
+        traces=_traces(each, rows, errors[0], after, attribution),
         remaining=given_dead_time(candidates, said, base),
         complete=complete,
         scope=scope,
@@ -320,7 +323,7 @@ def _scope(inference: Inference, kinds: Sequence[type[Effect]], channels: Sequen
 def _traces(
     logs: Sequence[Log], rows: CountedRows, before: FloatArray, after: FloatArray, attribution: RowAttribution
 ) -> Traces:
-    """`before`, `after` (channel, row, group): errors without and with what was named."""
+    """`before`, `after` (channel, row, group): errors of the baseline and of the repaired simulator."""
     measured = rows.measured.mean(-1)
     return Traces(
         time=rows.time,

@@ -24,7 +24,13 @@ from avtorch.plots.style import BLACK, BLUE, GREY, PURPLE, VERMILLION, styled
 
 _WIDE, _NARROW = (8.6, 260), (4.0, 120)
 """Width [in] and intervals of a line, on a desk and on a phone."""
-_COLOURS = {"command": GREY, "measured": BLACK, "baseline simulator": VERMILLION, "with what was named": BLUE}
+_COLOURS = {
+    "command": GREY,
+    "measured": BLACK,
+    "baseline simulator": VERMILLION,
+    "with what was named": BLUE,
+    "repaired simulator": BLUE,
+}
 _LABELS = {"accel": "acceleration [m/s²]", "speed": "speed [m/s]"}
 _BEYOND = 0.3  # of the measured range: how far beyond it a rollout is followed, whose speed may drift without end
 _GROUNDS: dict[Reason, tuple[str, dict[str, Any]]] = {
@@ -152,7 +158,9 @@ def drive_panels(found: Diagnosis) -> list[DrivePanel]:
     ):
         lines = {"command": traces.command} if name == "accel" else {}
         lines |= {"measured": measured, "baseline simulator": before}
-        if found.winner.effects:
+        if found.free_form is not None:
+            lines["repaired simulator"] = after
+        elif found.winner.effects:
             lines["with what was named"] = after
         panels.append(DrivePanel(_LABELS[name], lines))
     return panels

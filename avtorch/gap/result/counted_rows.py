@@ -95,11 +95,17 @@ class CountedRows:
         """Values (row of the data,) of each counted row, (row, group)."""
         return x[self._rows]
 
-    def simulated(self, h: Hypothesis) -> FloatArray:
+    def simulated(self, h: Hypothesis, adds: FloatArray | None = None) -> FloatArray:
         """What a hypothesis's car, behind its recorder, shows: (channel, row, group), a speed from the measured one at
-        the begin of its stretch on."""
+        the begin of its stretch on. `adds` (grid,): acceleration beyond the hypothesis's [m/s²]."""
         data = self.data
-        accel, gained = h.recorder_rows(*h.on_grid())
+        accel, gained = h.on_grid()
+        if adds is not None:
+            grid = h.data.grid
+            step = np.where(grid.starts, 0.0, np.diff(grid.time, prepend=grid.time[:1]))
+            more = np.cumsum(step * np.concatenate([adds[:1], adds[:-1]]))
+            accel, gained = accel + adds, gained + more
+        accel, gained = h.recorder_rows(accel, gained)
         out = []
         if accel is not None:
             out.append(accel[self._rows])
@@ -111,6 +117,6 @@ class CountedRows:
             out.append((gained + begun)[self._rows])
         return np.stack(out)
 
-    def errors(self, h: Hypothesis) -> FloatArray:
+    def errors(self, h: Hypothesis, adds: FloatArray | None = None) -> FloatArray:
         """Measured less simulated (channel, row, group)."""
-        return self.measured - self.simulated(h)
+        return self.measured - self.simulated(h, adds)
