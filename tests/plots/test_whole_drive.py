@@ -31,7 +31,7 @@ def found(channels: tuple[str, ...] = ("accel", "speed"), **more: Any) -> Any:
     )
     traces = Traces(time, np.sin(time), channels, *lines, np.zeros(len(time)), stretch, unused)
     given: dict[str, Any] = {"traces": traces, "onset_from_start_s": None, "onset_log": 0, "alarms": ()}
-    given["winner"] = SimpleNamespace(effects=("x",))
+    given |= {"winner": SimpleNamespace(effects=("x",)), "free_form": None}
     return SimpleNamespace(**{**given, **more})
 
 
