@@ -106,7 +106,7 @@ class FreeForm:
 
     def beside(self, car: GapPlant) -> GapPlant:
         """The car with the free form, without the gust of which it takes a part: what is left of that is not known."""
-        kept = [e for e in car.effects if "force_sd" not in e.noise_parameters.values()]
+        kept = [e for e in car.effects if "force_sd" not in e.noise_parameters]
         return plant([*kept, *self.effects()], T_L=self.T_L, K_L=float(car.K_L) + self.at.gain, sigma=float(car.sigma))
 
 

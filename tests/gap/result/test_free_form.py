@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from avtorch.gap import ForceTable, GapPlant, ResistanceCurve, plant
+from avtorch.gap import ConstantResistance, ForceTable, GapPlant, Gust, ResistanceCurve, plant
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.recorder import base_fit
@@ -87,3 +87,9 @@ def test_a_free_form_that_loses_in_the_budgets_runs_is_not_handed_back(named: fl
     assert held.free_gains == gains
     assert [x.squares[0, 0] for x in held.without_free().steps] == [4.0, 4.0 * named]
     assert not held.without_free().free
+
+
+def test_the_gust_beside_a_free_form_is_not_handed_back() -> None:
+    """The form takes a part of it; what is left is not known."""
+    back = found(mapped=True).form.beside(plant([Gust(0.3, 5.0), ConstantResistance(0.1)]))
+    assert [e.name for e in back.effects if e.name in ("gust", "constant_resistance")] == ["constant_resistance"]
