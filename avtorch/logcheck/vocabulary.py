@@ -114,7 +114,7 @@ def likeness(header: Header, signal: str) -> float:
     if header.name == signal:
         return 2.0
     wanted = _SIGNALS[signal]
-    if any(word in wanted.not_ & (_COMMAND | _LEAD) for word in header.words):
+    if any(word in wanted.not_ and word in _COMMAND | _LEAD for word in header.words):
         return 0.0
     return max((_likeness(words, wanted) for words in header.endings), default=0.0)
 

@@ -368,7 +368,7 @@ def _echoes(x: Examined, names: list[str]) -> list[tuple[list[str] | None, float
     h = x.hypothesis
     base = h.base or h
     linear = sorted(_LINEAR & set(names))
-    gains = {(e,): x.beside[e][1] for e in linear if e in x.beside}
+    gains: dict[tuple[str, ...], float] = {(e,): x.beside[e][1] for e in linear if e in x.beside}
     if linear and len(linear) == len(h.effects):
         gains[tuple(linear)] = h.evidence - base.evidence
     return [
