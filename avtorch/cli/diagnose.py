@@ -194,12 +194,7 @@ def diagnose(
             "posterior": posterior == "sgld",
         }
         idle = {"simulated": simulated, "simulator": simulator, "step": step is not None, "adjust": adjust}
-        idle |= {
-            "named_only": named_only,
-            "estimates": estimates,
-            "rollouts": rollouts is not None,
-            "processes": processes != 1,
-        }
+        idle |= {"estimates": estimates, "rollouts": rollouts is not None, "processes": processes != 1}
         idle |= {"baseline": assumed, "prior": weights, "budget": budget is not None}
         idle |= {option: not default for option, default in usual.items()}
         refuse(logs, **idle, **{option: value is not None for option, value in track.items()})

@@ -19,8 +19,8 @@ _CELLS = 24  # a side of the map
 
 
 def force_contours(ax: Axes, found: Diagnosis) -> Axes:
-    """Force beyond K u [m/s²] of the force map over speed and command; hatched, what was not driven: there the map goes
-    back to K u. Raises `InputError` without a force map."""
+    """Force beyond K u [m/s²] of the force map over speed and command; hatched, what was not driven: there only its
+    smoothness speaks, and far from the drive it goes back to K u. Raises `InputError` without a force map."""
     form = found.free_form
     if form is None or not form.sizes.table > 0:
         raise InputError("free_form: the repaired simulator has no force map to draw")

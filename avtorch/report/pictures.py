@@ -130,8 +130,8 @@ def _free_form(found: Diagnosis) -> Picture | None:
         " ".join(says),
         of_numbers("What the repaired simulator carries without a name", tuple(columns), rows, (".3g",) * len(columns)),
         caption="What the car's force does beyond the gain and what was named, as the repaired simulator carries it. "
-        "Hatched: not driven; there it goes back to K u. A dead band, a limit or an asymmetry of the drive may hide "
-        "in it.",
+        "Hatched: not driven; there nothing but its smoothness speaks, and far from the drive it goes back to K u. A "
+        "dead band, a limit or an asymmetry of the drive may hide in it.",
     )
 
 
