@@ -41,6 +41,16 @@ Out = Annotated[
     Path,
     Parameter(name="--out", group=OUTPUT, converter=local_folder, help="Folder for the answer and the pictures."),
 ]
+Columns = Annotated[
+    list[str] | None,
+    Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
+]
+Units = Annotated[
+    list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable.")
+]
+Stamps = Annotated[
+    list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
+]
 Json = Annotated[bool, Parameter(name="--json", negative=(), group=OUTPUT, help="Print the answer as JSON, no tables.")]
 Quiet = Annotated[bool, Parameter(name=("--quiet", "-q"), negative=(), group=OUTPUT, help="Print nothing but errors.")]
 Seed = Annotated[int, Parameter(name="--seed", converter=whole_number, help="Seed of everything random.")]

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from avtorch.cli.arguments import OUTPUT, Json, Quiet
+from avtorch.cli.arguments import OUTPUT, Columns, Json, Quiet, Units
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError
 
@@ -16,13 +16,8 @@ from avtorch.errors import InputError
 def check(
     log: Path,
     *,
-    map: Annotated[
-        list[str] | None,
-        Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
-    ] = None,
-    unit: Annotated[
-        list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable.")
-    ] = None,
+    map: Columns = None,
+    unit: Units = None,
     yes: Annotated[
         bool, Parameter(name=("--yes", "-y"), negative=(), group=OUTPUT, help="Write the proposed mapping unasked.")
     ] = False,

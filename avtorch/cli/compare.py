@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from rich.markup import escape
 from rich.table import Table
 
-from avtorch.cli.arguments import OUTPUT, Json, Quiet, free_folder, local_folder
+from avtorch.cli.arguments import OUTPUT, Columns, Json, Quiet, Units, free_folder, local_folder
 from avtorch.cli.browser import Open, show
 from avtorch.cli.command_line import origin_of
 from avtorch.cli.simulator import read_simulator
@@ -65,13 +65,8 @@ def compare(
         Path | None,
         Parameter(name="--out", group=OUTPUT, converter=local_folder, help="Folder for comparison.html and .json."),
     ] = None,
-    map: Annotated[
-        list[str] | None,
-        Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
-    ] = None,
-    unit: Annotated[
-        list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable.")
-    ] = None,
+    map: Columns = None,
+    unit: Units = None,
     open_page: Open = False,
     json: Json = False,
     quiet: Quiet = False,

@@ -12,7 +12,19 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Group, Parameter
 from rich.markup import escape
 
-from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, local_folder, positive, seed_number
+from avtorch.cli.arguments import (
+    OUTPUT,
+    Columns,
+    Json,
+    Quiet,
+    Seed,
+    Stamps,
+    Units,
+    free_folder,
+    local_folder,
+    positive,
+    seed_number,
+)
 from avtorch.cli.browser import Open, show
 from avtorch.cli.command_line import origin_of
 from avtorch.cli.diagnosis_table import budget_table, diagnosis_headline, diagnosis_notes, diagnosis_table
@@ -46,16 +58,9 @@ def diagnose(
             name="--out", group=OUTPUT, converter=local_folder, help="Folder for the answer and the repaired simulator."
         ),
     ],
-    map: Annotated[
-        list[str] | None,
-        Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
-    ] = None,
-    unit: Annotated[
-        list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable.")
-    ] = None,
-    stamp: Annotated[
-        list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
-    ] = None,
+    map: Columns = None,
+    unit: Units = None,
+    stamp: Stamps = None,
     baseline: Annotated[
         str, Parameter(help="Your simulator: glvd, effects such as dead_time=0.2, or a TOML file.")
     ] = "glvd",

@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from avtorch.cli.arguments import (
+    Columns,
     Gains,
     Json,
     Out,
     Quiet,
     Seed,
+    Stamps,
     TimeGap,
+    Units,
     free_folder,
     not_negative,
     positive,
@@ -38,16 +41,9 @@ def estimate(
     *,
     window: Annotated[float, Parameter(help="Length of a window [s].")] = 2.0,
     out: Out,
-    map: Annotated[
-        list[str] | None,
-        Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
-    ] = None,
-    unit: Annotated[
-        list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable.")
-    ] = None,
-    stamp: Annotated[
-        list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
-    ] = None,
+    map: Columns = None,
+    unit: Units = None,
+    stamp: Stamps = None,
     form: Annotated[
         Literal["auto", "jerk", "latent"],
         Parameter(help="Likelihood: of measured jerk, or of noisy acceleration and speed."),

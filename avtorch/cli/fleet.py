@@ -17,6 +17,7 @@ from avtorch.cli.arguments import (
     Json,
     Quiet,
     Seed,
+    Stamps,
     TimeGap,
     free_folder,
     local_folder,
@@ -64,9 +65,7 @@ def fleet(
     unit: Annotated[
         list[str] | None, Parameter(negative=(), help="Unit of a column in all logs, SIGNAL=UNIT; repeatable.")
     ] = None,
-    stamp: Annotated[
-        list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
-    ] = None,
+    stamp: Stamps = None,
     window: Annotated[float, Parameter(help="Length of a window [s].")] = 2.0,
     estimator: Annotated[
         Literal["auto", "sgld", "importance", "map", "rls", "ekf", "ukf"],

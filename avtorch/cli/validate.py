@@ -9,7 +9,20 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from avtorch.cli.arguments import Json, Out, Quiet, Seed, free_folder, not_negative, positive, seed_number, whole_number
+from avtorch.cli.arguments import (
+    Columns,
+    Json,
+    Out,
+    Quiet,
+    Seed,
+    Stamps,
+    Units,
+    free_folder,
+    not_negative,
+    positive,
+    seed_number,
+    whole_number,
+)
 from avtorch.cli.browser import Open, show
 from avtorch.cli.command_line import origin_of
 from avtorch.cli.talk import Talk, write_answer
@@ -48,16 +61,9 @@ def validate(
     spread: Annotated[float, Parameter(help="Posterior SDs around the mode at which chains start.")] = 0.0,
     chains: Annotated[int | None, Parameter(converter=whole_number, help="SGLD chains per window.")] = None,
     draws: Annotated[int | None, Parameter(converter=whole_number, help="Draws kept of each chain.")] = None,
-    map: Annotated[
-        list[str] | None,
-        Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
-    ] = None,
-    unit: Annotated[
-        list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable.")
-    ] = None,
-    stamp: Annotated[
-        list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
-    ] = None,
+    map: Columns = None,
+    unit: Units = None,
+    stamp: Stamps = None,
     seed: Seed = 0,
     open_page: Open = False,
     json: Json = False,
