@@ -389,6 +389,7 @@ class DriveData:
         changed = (np.diff(self.speed) != 0) & (np.diff(self.count) == 1)
         for k in range(10, 1, -1):
             counts = np.bincount(self.count[1:][changed] % k, minlength=k)
+            # a repeated row at a renewal shows it a row late; without a hold a k-th of the changes is here
             if counts.max() > 0.9 * counts.sum() and counts.sum() > 30:
                 return k, int(counts.argmax())
         return 1, 0
