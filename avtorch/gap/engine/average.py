@@ -3,9 +3,10 @@
 Beside its effects every hypothesis may have a slow random force (gust or road), outliers of the accelerometer, and a
 free form of some family; all are valued in nats of the same likelihood. Each such composition supports labels. Its own
 is its effects by name. But an effect may be an error of the shape of the others, and then the label is without it; a
-free form may be that, too, or a cause without a name, `unknown`. A force map of the base is a part without a name
-beside those that have one; so is, in front of it, any other free form, and `unknown` is the label where no part has a
-name. Labels add up what supports them:
+free form may be that, too, or a cause without a name, `unknown`. Beside names a free form is a part without one, or all
+of them together describe one unknown cause: one cause is likelier than several, and a term of a description is cheaper
+than a cause. A force map of the base is a part without a name beside those that have one; there `unknown` is the label
+where no part has a name. Labels add up what supports them:
 
     P(label) ~ sum exp(TEMPER (log evidence + log odds))
 """
@@ -31,12 +32,20 @@ from avtorch.gap.engine.priors import (
     OUTLIER_NATS,
     SLOW_FORCE_NATS,
     TEMPER,
+    TRIED_NATS,
     UNKNOWN_NATS,
     WITHIN_NATS,
 )
 from avtorch.gap.engine.search import Search
 from avtorch.gap.engine.shape_error import log_prior, relative_size, shape_likelihood, shape_log_odds
-from avtorch.gap.engine.slow_forces import SlowForces, band_covariance, gust_onset, pulling_lags, slow_forces
+from avtorch.gap.engine.slow_forces import (
+    GustOnset,
+    SlowForces,
+    band_covariance,
+    gust_onset,
+    pulling_lags,
+    slow_forces,
+)
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
 _EXAMINED = 8  # hypotheses that are examined in full
@@ -162,17 +171,14 @@ def examine(h: Hypothesis, search: Search) -> Examined:
     exact = h.evidence - log_sum(h.shape_log)
     compositions = [_composed(h, "", 0.0, h.residual, exact, lags)]
     assert compositions[0] is not None
-    late = None
-    if compositions[0].slow.gust > 4:
-        nats, late = gust_onset(data, h.residual, first)
-        late = late if nats > 2 else None
-        compositions[0] = _set_in(compositions[0], nats, late)
+    late = gust_onset(data, h.residual, first)
+    compositions[0] = _set_in(compositions[0], late)
     for name, found in forms.items():
         if found.residual is None:
             continue
         c = _composed(h, name, found.nats, found.residual, exact, lags, least=3.0 if alone else -6.0)
         if c is not None:
-            compositions.append(_set_in(c, nats, late) if late is not None else c)
+            compositions.append(_set_in(c, late))
     beside = {}
     for e in h.effects if len(h.effects) > 1 else []:
         rest = search.without(h, e)
@@ -303,11 +309,12 @@ def _composed(
     return Composition(form, over, relative, {k: log_sum(v) for k, v in parts.items()}, best[1])
 
 
-def _set_in(c: Composition, nats: float, onset: float | None) -> Composition:
-    """The composition with a gust that sets in during the drive."""
-    if onset is None:
+def _set_in(c: Composition, late: GustOnset) -> Composition:
+    """The composition with a gust that sets in during the drive, where that gains more than one time is worth."""
+    if late.time is None:
         return c
-    return Composition(c.form, c.nats, c.relative, {**c.total, "gust": c.total["gust"] + nats}, c.slow, onset)
+    slow = replace(c.slow, gust_sd=late.sd, gust_time=late.correlation)
+    return replace(c, total={**c.total, "gust": c.total["gust"] + late.nats}, slow=slow, gust_onset=late.time)
 
 
 def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Weight]:
@@ -338,6 +345,9 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
             labels = [(names or None, -UNKNOWN_NATS)] + [
                 (label, worth + shape_log_odds(c.relative, c.nats, h.effects)) for label, worth in labels
             ]
+            if names and h.force is None and c.nats > 0:
+                # or one cause without a name does it all, and the names are but terms of its description
+                labels.append((None, -UNKNOWN_NATS + (each - TRIED_NATS) * count))
         total, kinds = dict(c.total), SLOW
         if alone:  # some slow force is any drive's
             large = c.slow.gust_sd > _LARGE_OF_COMMAND * h["K_L"] * float(np.std(h.data.command))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Self
 
@@ -305,7 +305,12 @@ class DriveData:
 
     def aligned(self, accel: FloatArray) -> FloatArray:
         """As late as the speed: what shakes the car is then in phase in both."""
-        return np.interp(self.time - self.align_s, self.time, accel) if self.align_s else accel
+        if not self.align_s:
+            return accel
+        rows = np.arange(len(self.time))
+        return self._between(
+            f"aligned by {self.align_s}", lambda: np.interp(self.time - self.align_s, self.time, rows), accel
+        )
 
     def speed_difference(self, speed: FloatArray) -> FloatArray:
         """Central difference [m/s²], in phase with the acceleration."""
@@ -319,10 +324,7 @@ class DriveData:
         """As a recorder shows it that refreshes every `hold` rows, whether or not that row was lost."""
         if self.hold == 1:
             return x
-        n, count = np.arange(len(x)), self.count + self.log * (2 * self.count.max() + self.hold)
-        since = (self.count - self.hold_phase) % self.hold
-        first = np.repeat(self.bounds[:-1], np.diff(self.bounds))
-        return np.interp(np.maximum(np.interp(count - since, count, n), first), n, x)
+        return self._between(f"held for {self.hold} from {self.hold_phase}", self._refreshed, x)
 
     def low_pass(self, x: FloatArray, time_constant: float) -> FloatArray:
         """One pole of this time constant [s], at rest at the start of each stretch (see `one_pole`)."""
@@ -337,6 +339,23 @@ class DriveData:
     # inside ----------------------------------------------------------------------------------------------------------
     def _measured(self) -> FloatArray:
         return self.transform(self.channel_rows(self.accel, self.speed))
+
+    def _refreshed(self) -> FloatArray:
+        """Row (row,) of the last refresh, between two rows where that one was lost."""
+        count = self.count + self.log * (2 * self.count.max() + self.hold)
+        since = (self.count - self.hold_phase) % self.hold
+        first = np.repeat(self.bounds[:-1], np.diff(self.bounds))
+        return np.maximum(np.interp(count - since, count, np.arange(len(count))), first)
+
+    def _between(self, name: str, places: Callable[[], FloatArray], x: FloatArray) -> FloatArray:
+        """`x` (row,) read linearly at `places` (row,) between rows, which are computed once under a `name`."""
+        if name not in self.cache:
+            at = places()
+            below = np.clip(at.astype(np.int64), 0, len(at) - 2)
+            self.cache[name] = below, at - below
+        below, share = self.cache[name]
+        out = x[below]
+        return out + share * (x[below + 1] - out)
 
     def _with_bins(self, edges: IntArray) -> DriveData:
         other = copy.copy(self)

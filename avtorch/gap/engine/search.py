@@ -17,6 +17,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, EngineEffect, base_name
+from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.evidence import evaluate_evidence
 from avtorch.gap.engine.force_base import prices, resized, with_force_map
 from avtorch.gap.engine.gauss_newton import fit, linearised, normal_prior, objective, whitened_jacobian
@@ -32,7 +33,6 @@ _GRID_FITS = 4e6  # fits times grid points: what a long drive may cost
 _WIDTH, _LATER_WIDTH = 9, 6  # effects fitted from the base, and from a set
 _FINISHED = 3  # of these, how many are finished
 _RAMPS = 10  # of a gain that changes, from a second to the drive's length
-_CUTS = 12  # onsets at which a response's size is computed; between them it is interpolated
 _MARGIN_S = 8.0  # no onset this near to an end of the drive
 _LEAST_PROMISE = 1.5  # nats: less is the gain of a parameter that does nothing
 _SLOPES = {"dead_time": 0.02, "sensor_lag": 0.02, "square_period": 0.002}  # where a recorder hides a finite step
@@ -318,6 +318,7 @@ class _Projection:
         r = np.concatenate([whiten(h.data, h.covariance, h.residual), pull / np.sqrt(np.maximum(precision, 1e-30))])
         size = np.linalg.norm(A, axis=1)
         self._basis = np.linalg.qr((A[size > 1e-9] / size[size > 1e-9, None]).T)[0]
+        self._basis_by_frame = _by_frame(h.data, self._basis[: -self.rows])
         self.residual = r - self._basis @ (self._basis.T @ r)
 
         self._data, self._spread = h.data, None
@@ -329,6 +330,13 @@ class _Projection:
     def __call__(self, whitened: FloatArray) -> FloatArray:
         x = np.concatenate([whitened, np.zeros(self.rows)])
         return x - self._basis @ (self._basis.T @ x)
+
+    def sizes_from(self, whitened: FloatArray) -> FloatArray:
+        """Square (frame,) of the projected response that begins with each frame: whole, less its part in the span."""
+        x = _by_frame(self._data, whitened)
+        spanned = (x[:, None] @ self._basis_by_frame)[:, 0]
+        energy, spanned = (x * x).sum(1)[::-1].cumsum(), spanned[::-1].cumsum(0)
+        return np.maximum(energy - (spanned**2).sum(1), 0.0)[::-1]
 
     def nats(self, free: FloatArray, e: EngineEffect, start: Sequence[float]) -> float:
         """What the best multiple of a projected response gains, its size penalised by the effect's prior; the noise's
@@ -344,6 +352,13 @@ class _Projection:
         shape = data.channel_count, data.frame_count, data.bin_count
         nats = log_likelihood(data, x[: -self.rows].reshape(shape), self._spread)[0]
         return nats - 0.5 * float(x[-self.rows :] @ x[-self.rows :])
+
+
+def _by_frame(data: DriveData, whitened: FloatArray) -> FloatArray:
+    """Coefficients of all channels (channel x frame x bin, ...) by frame: (frame, channel x bin, ...)."""
+    by_frame = whitened.reshape(data.channel_count, data.frame_count, data.bin_count, *whitened.shape[1:])
+    by_frame = np.moveaxis(by_frame, 1, 0)
+    return np.ascontiguousarray(by_frame.reshape(data.frame_count, -1, *whitened.shape[1:]))
 
 
 def promises(h: Hypothesis, candidates: Sequence[EngineEffect]) -> list[Promise]:
@@ -420,20 +435,12 @@ def _onsets(
     """The two best onsets, and those of effects that are in: the residual's adjoint prices all rows at once, then the
     response is computed."""
     data = h.data
-    cuts = np.unique(np.round(np.linspace(0.12, 0.88, _CUTS) * data.frame_count).astype(int))
-    cuts = cuts[(cuts > 0) & (cuts < data.frame_count)]
-    if not len(cuts):
+    if data.frame_count < 2:
         return []
     gains = np.cumsum(steps[::-1])[::-1]
-    by_frame = whitened.reshape(data.channel_count, data.frame_count, -1)
-    sizes = []
-    for c in cuts:
-        part = by_frame.copy()
-        part[:, :c] = 0
-        free = projection(part.ravel())
-        sizes.append(float(free @ free))
-    size = np.interp(data.time, data.frame_time[cuts] - 0.5 * data.hop_s, sizes)
-    size = np.maximum(size, 0.15 * max(sizes))
+    sizes = projection.sizes_from(whitened)
+    size = np.interp(data.time, data.frame_time - 0.5 * data.hop_s, sizes)
+    size = np.maximum(size, 0.15 * sizes.max())
     inside = (data.time > data.time[0] + _MARGIN_S) & (data.time < data.time[-1] - _MARGIN_S)
     priced = np.where(inside & ((gains > 0) | (not e.one_sided)), 0.5 * gains**2 / (size + 1), 0.0)
     tried = [(onset, 0.0) for onset in sorted(set(h.onsets.values()))]

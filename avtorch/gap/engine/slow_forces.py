@@ -33,7 +33,7 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.priors import SLOW_HZ
+from avtorch.gap.engine.priors import ONSET_ODDS, SLOW_HZ
 
 # priors: log-normal, by mean and standard deviation of the logarithm
 PROCESS_NOISE = (0.03, 0.8)
@@ -59,8 +59,6 @@ PULLING_LAG_RATIOS = 2.0 ** np.arange(6)
 """Lags over the actuator's own, by which a saturated actuator pulls back what disturbs it [-]."""
 ONSET_SHARES = (0.12, 0.85)
 """Shares of a drive's frames between which a gust may set in: both parts show what they hold."""
-STRONGER_GRID = np.array([1.0, 1.4, 2.0])
-"""Power of a gust after it has set in, over its mean power in the whole drive [-]: 1 at the start, 2 halfway."""
 
 AT_LIMIT = 0.97
 """Share of the limit of jerk from which on it is at work [-]: a filter of the recorder rounds its corners."""
@@ -353,20 +351,37 @@ def slow_forces(
     )
 
 
-def gust_onset(data: DriveData, residual: FloatArray, found: SlowForces) -> tuple[float, float | None]:
-    """Nats of the gust `found` in a residual if it sets in during the drive, over one that blows throughout, and when.
+class GustOnset(NamedTuple):
+    """A gust that sets in at `time` [s]: its `nats` over one that blows throughout, `sd` [m/s²] and `correlation` [s]
+    from then on; no nats and no time (None) where it does not."""
 
-    Sensors and process noise are alike before and after. (0, None) where it does not, or drives are short. Time [s].
+    nats: float
+    time: float | None = None
+    sd: float = 0.0
+    correlation: float = 0.0
+
+
+def gust_onset(data: DriveData, residual: FloatArray, found: SlowForces) -> GustOnset:
+    """When a gust sets in, if it does: between `ONSET_SHARES` of the frames, in drives of ten frames or more.
+
+    Process noise alone explains what was before, the same with a gust what comes after; `found` of the whole drive
+    tells only the sensors, for over both parts a gust of half the time passes for process noise, or this for a gust.
     """
     frames = data.frame_count
     if frames < 10:
-        return 0.0, None
-    bands, process, gust = found.bands, found.process_power, found.gust_power
-    whole = found.covariance
+        return GustOnset(0.0)
+    frequency, energy = band_response(data)
+    unit = found.process_power / found.process_noise_beside_gust**2
+    process = PROCESS_NOISE_GRID[:, None] ** 2 * unit
+    of_process = _log_normal(PROCESS_NOISE_GRID, PROCESS_NOISE)
+    gust = SIZE_GRID_MPS2[:, None, None] ** 2 * (gust_spectrum(frequency, GUST_TIME_GRID_S) @ energy.T)
+    of_gust = _log_normal(SIZE_GRID_MPS2, GUST_SD_MPS2)[:, None] + _log_normal(GUST_TIME_GRID_S, GUST_TIME_S)
+    gust, of_gust = gust.reshape(-1, found.bands), of_gust.ravel()
+    whole, throughout = found.covariance, found.process_power + found.gust_power
     if data.channel_count == 2:
-        variances = wishart_profile(whole, found.counts, process + gust)[1]
+        variances = wishart_profile(whole, found.counts, throughout)[1]
     else:
-        variances = np.maximum(whole[:, 0, 0] - process - gust, _SENSOR_FLOOR * whole[:, 0, 0])
+        variances = np.maximum(whole[:, 0, 0] - throughout, _SENSOR_FLOOR * whole[:, 0, 0])
 
     def nats(covariance: FloatArray, counts: FloatArray, power: FloatArray) -> FloatArray:
         """(...,) of powers (..., band), the sensors as they are."""
@@ -375,7 +390,7 @@ def gust_onset(data: DriveData, residual: FloatArray, found: SlowForces) -> tupl
         total = power + variances
         return (-0.5 * counts * (np.log(total) + covariance[..., 0, 0] / total)).sum(-1)
 
-    edges = data.band_edges[: bands + 1]
+    edges = data.band_edges[: found.bands + 1]
     low = residual[:, :, : edges[-1]]
     products = np.moveaxis(np.add.reduceat(low[:, None] * low, edges[:-1], axis=-1), 2, 0)  # frame, C, C, band
     before = np.moveaxis(np.cumsum(products, axis=0), -1, 1) / np.diff(edges)[:, None, None] * found.sensor
@@ -384,13 +399,23 @@ def gust_onset(data: DriveData, residual: FloatArray, found: SlowForces) -> tupl
     m = np.diff(edges) * (frames - cuts[:, None].astype(float))
     first = before[cuts - 1] / cuts[:, None, None, None]
     second = (before[-1] - before[cuts - 1]) / (frames - cuts)[:, None, None, None]
-    stronger = process + STRONGER_GRID[:, None, None] * gust  # (power, 1, band)
-    gains = nats(first, n, process) + nats(second, m, stronger).max(0)
-    gains -= nats(whole, found.counts, process + gust) + math.log(len(cuts))  # one of so many frames
-    if gains.max() <= 0:
-        return 0.0, None
-    at = int(np.argmax(gains))
-    return float(gains[at]), float(data.frame_time[cuts[at]] - 0.5 * data.hop_s)
+    # at each cut the process noise that the first part shows, then both together at the best cut
+    calm = nats(first[:, None], n[:, None], process) + of_process
+    at = calm.argmax(1)
+    gains = calm.max(1) + (nats(second[:, None], m[:, None], process[at][:, None] + gust) + of_gust).max(1)
+    cut = int(gains.argmax())
+    both = calm[cut][:, None] + nats(second[cut], m[cut], process[:, None] + gust) + of_gust
+    size, time = np.unravel_index(int(both.max(0).argmax()), (len(SIZE_GRID_MPS2), len(GUST_TIME_GRID_S)))
+    alike = np.array([found.process_noise_beside_gust]), np.array([found.gust_sd]), np.array([found.gust_time])
+    over = float(nats(whole, found.counts, throughout)) + sum(
+        float(_log_normal(x, prior)[0])
+        for x, prior in zip(alike, (PROCESS_NOISE, GUST_SD_MPS2, GUST_TIME_S), strict=True)
+    )
+    gain = float(both.max()) - over + math.log(ONSET_ODDS / len(cuts))  # one of so many frames
+    if gain <= 0:
+        return GustOnset(0.0)
+    onset = float(data.frame_time[cuts[cut]] - 0.5 * data.hop_s)
+    return GustOnset(gain, onset, float(SIZE_GRID_MPS2[size]), float(GUST_TIME_GRID_S[time]))
 
 
 # inside ---------------------------------------------------------------------------------------------------------------

@@ -215,24 +215,39 @@ def test_a_gust_that_sets_in_tells_when(channels: tuple[str, ...], rotating_seed
     onset = 330.0
     force = 0.4 * _ornstein_uhlenbeck(rng, len(data.time), 1.5) * (data.time > onset)
     residual = _residual(data, rng, force)
-    nats, when = gust_onset(data, residual, slow_forces(data, residual, NEUTRAL))
-    assert nats > log_odds(data.frame_count)
-    assert when is not None
-    assert abs(when - onset) < 2 * data.hop_s  # a frame
+    found = gust_onset(data, residual, slow_forces(data, residual, NEUTRAL))
+    assert found.nats > log_odds(data.frame_count)
+    assert found.time is not None
+    assert abs(found.time - onset) < 2 * data.hop_s  # a frame
+    # 180 correlation times: 8 %, and a step of the grid
+    assert found.sd == pytest.approx(0.4, rel=0.28 + BAR * 0.08)
+
+
+@pytest.mark.statistical
+def test_a_late_gust_over_strong_process_noise_tells_when(rotating_seed: int) -> None:
+    """Over the whole drive both together may pass for a gust alone, with no process noise left for the first part."""
+    rng, data = np.random.default_rng(rotating_seed), _data(600)
+    force = _process_noise(rng, len(data.time), 0.16)
+    force += 0.15 * _ornstein_uhlenbeck(rng, len(data.time), 1.4) * (data.time > 330.0)
+    residual = _residual(data, rng, force)
+    found = gust_onset(data, residual, slow_forces(data, residual, NEUTRAL))
+    assert found.nats > log_odds(data.frame_count)
+    assert found.time is not None
+    assert abs(found.time - 330.0) < 4 * data.hop_s  # two frames
 
 
 @pytest.mark.statistical
 def test_a_gust_that_blows_throughout_has_no_onset(rotating_seed: int) -> None:
     rng, data = np.random.default_rng(rotating_seed), _data(600)
     residual = _residual(data, rng, 0.3 * _ornstein_uhlenbeck(rng, len(data.time), 1.5))
-    assert gust_onset(data, residual, slow_forces(data, residual, NEUTRAL))[0] < log_odds(3 * data.frame_count)
+    assert gust_onset(data, residual, slow_forces(data, residual, NEUTRAL)).nats < log_odds(3 * data.frame_count)
 
 
 def test_short_drives_have_no_onset(fresh_seed: int) -> None:
     rng, data = np.random.default_rng(fresh_seed), _data(40)
     residual = _residual(data, rng, np.zeros(len(data.time)))
     assert data.frame_count < 10
-    assert gust_onset(data, residual, slow_forces(data, residual, NEUTRAL)) == (0.0, None)
+    assert gust_onset(data, residual, slow_forces(data, residual, NEUTRAL)).time is None
 
 
 def test_what_is_given_replaces_the_residuals(fresh_seed: int) -> None:
