@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name
-from avtorch.gap.engine.free_forms import block, families, mirror_columns, tone, wandering
+from avtorch.gap.engine.free_forms import FreeFormFit, block, families, mirror_columns, tone, wandering
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import log_sum
 from avtorch.gap.engine.outliers import Outliers, sensor_outliers
@@ -156,29 +156,20 @@ def examined_sets(search: Search) -> list[Examined]:
 def examine(h: Hypothesis, search: Search) -> Examined:
     """Everything that may be beside the effects of one hypothesis, in nats."""
     data, alone = h.data, search.alone
-    # where bases have a map, it is there that a map stands beside these effects
-    others = {name: form for name, form in families(h).items() if name != "map" or not search.map_bases}
-    forms = {name: block(h, form) for name, form in others.items()}
-    mirror = 0.0
-    if not alone and data.channel_count == 2 and (forms["linear"].nats > 0 or _LINEAR & set(h.names)):
-        mirror = max(block(h, mirror_columns(h)).nats, 0.0)
-        forms["linear"] = forms["linear"]._replace(nats=forms["linear"].nats - mirror)
-    forms |= wandering(h)
-    lags = pulling_lags(h)
-    first = slow_forces(data, h.residual, _from_the_start(h), lags=lags)
-    steady = tone(h, 0.1 if max(first.gust, first.road) < 30 else 0.4).fit
-    forms["tone"] = steady._replace(nats=steady.nats - 5)
     exact = h.evidence - log_sum(h.shape_log)
+    lags = pulling_lags(h)
     compositions = [_composed(h, "", 0.0, h.residual, exact, lags)]
-    assert compositions[0] is not None
-    late = gust_onset(data, h.residual, first)
-    compositions[0] = _set_in(compositions[0], late)
-    for name, found in forms.items():
-        if found.residual is None:
-            continue
-        c = _composed(h, name, found.nats, found.residual, exact, lags, least=3.0 if alone else -6.0)
-        if c is not None:
-            compositions.append(_set_in(c, late))
+    mirror = 0.0
+    if not alone:  # with one channel no free form can be told from the base's own dynamics and slow force
+        first = slow_forces(data, h.residual, _from_the_start(h), lags=lags)
+        forms, mirror = _free_forms(h, search, first)
+        late = gust_onset(data, h.residual, first)
+        compositions += [
+            _composed(h, name, found.nats, found.residual, exact, lags, least=-6.0)
+            for name, found in forms.items()
+            if found.residual is not None
+        ]
+        compositions = [_set_in(c, late) for c in compositions if c is not None]
     beside = {}
     for e in h.effects if len(h.effects) > 1 else []:
         rest = search.without(h, e)
@@ -190,6 +181,21 @@ def examine(h: Hypothesis, search: Search) -> Examined:
         beside[base_name(e)] = (min(size, 99.0), h.evidence - rest.evidence)
     outliers = sensor_outliers(h) if data.accel is not None else None
     return Examined(h, exact, tuple(c for c in compositions if c is not None), outliers, beside, mirror)
+
+
+def _free_forms(h: Hypothesis, search: Search, slow: SlowForces) -> tuple[dict[str, FreeFormFit], float]:
+    """Each free form beside a hypothesis whose slow forces are `slow`, and the nats of the mirrored linear bank."""
+    # where bases have a map, it is there that a map stands beside these effects
+    others = {name: form for name, form in families(h).items() if name != "map" or not search.map_bases}
+    forms = {name: block(h, form) for name, form in others.items()}
+    mirror = 0.0
+    if forms["linear"].nats > 0 or _LINEAR & set(h.names):
+        mirror = max(block(h, mirror_columns(h)).nats, 0.0)
+        forms["linear"] = forms["linear"]._replace(nats=forms["linear"].nats - mirror)
+    forms |= wandering(h)
+    steady = tone(h, 0.1 if max(slow.gust, slow.road) < 30 else 0.4).fit
+    forms["tone"] = steady._replace(nats=steady.nats - 5)
+    return forms, mirror
 
 
 def average(
@@ -330,8 +336,6 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
     ]
     spike = min(spikes) if spikes else -np.inf
     for c in x.compositions:
-        if alone and c.form and (h.data.channel_count == 1 or c.form == "linear"):
-            continue
         labels: list[tuple[list[str] | None, float]] = [(names, 0.0)]
         for effect, (size, gain) in x.beside.items():
             if effect in names:  # the error of the others' shape
