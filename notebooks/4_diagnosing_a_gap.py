@@ -28,7 +28,7 @@ OUT = Path("out/notebooks/4_diagnosing_a_gap")
 # ## A sealed case
 #
 # The first case of set 2026 with a single effect of medium strength, over a minute. Other seeds hold other cases; a
-# diagnosis gets some of them wrong, and [how often](../docs/diagnosis.md) was counted on a thousand.
+# diagnosis gets some of them wrong, and [how often](../docs/diagnosis.md#how-well-it-does) is counted on sealed cases.
 
 # %%
 case = next(draw_cases(1, 2026, mix={"single": 1.0}, tiers=["medium"], seconds=60.0))

@@ -87,8 +87,8 @@ if cars:
 #
 # All this is conditional on the form of the law, and concerns controller and car together. The slopes of the road,
 # which is surveyed, hardly show in these speeds, because the lower level of a production car realises the demand
-# uphill and down: the road cannot be recovered from a follower's speed. [Real cars](../docs/real-cars.md) has the
-# figures, for 54 drives.
+# uphill and down: the road cannot be recovered from a follower's speed. [Real cars](../benchmarks/real_cars.md) has the
+# command for all 54 drives.
 #
 # ## A car whose commands are known
 #

@@ -199,6 +199,6 @@ for key in ("accel_rms_ratio", "jerk_rms_mps3", "min_spacing_m"):
 # ## Try this
 #
 # - A `torch.nn.Module` as the controller: the same call, the same derivatives.
-# - `PedalMap` with `memory`: a pedal that sticks (`StickyPedal` in [the page](../docs/own-effect.md)).
+# - `PedalMap` with `memory`: a pedal that sticks ([effects with memory](../docs/own-effect.md#with-memory)).
 # - `plant([PedalMap(0.4)], baseline=...)` behind your controller: does the diagnosis name the effect?
 # - `avtorch.MPC()` as the controller: it has a setting of its own, so no `setting=` is needed.

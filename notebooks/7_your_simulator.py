@@ -3,7 +3,7 @@
 #
 # You have a simulator that avtorch knows nothing of, and the log of a car. Three questions: where is the simulator
 # wrong, what does it lack, and how much better is it with that in it? Here the simulator is a class of a dozen lines;
-# an [FMU](../docs/fmu.md) or the simulator's output alone would do as well.
+# an [FMU](../docs/simulators.md#fmus) or the simulator's output alone would do as well.
 
 # %%
 from collections import deque

@@ -191,5 +191,5 @@ print({name: round(error, 2) for name, error in errors.items()}, "m/s, root mean
 #   left, and how much of the peak gain?
 # - Give the car a cause outside the table: `blindtest.draw_cases(1, 2026, mix={"outside": 1.0}, seconds=90.0)`.
 #   How much of the gap is unexplained, and where does it lie?
-# - Hand it on as an FMU: `avtorch.external.write_fmu(found, "better.fmu")` ([FMUs](../docs/fmu.md)).
+# - Hand it on as an FMU: `avtorch.external.write_fmu(found, "better.fmu")` ([FMUs](../docs/simulators.md#fmus)).
 # - A simulator that is a program, and no plant: [notebook 7](7_your_simulator.ipynb).

@@ -1,24 +1,36 @@
-"""The pages: their links lead somewhere; those on commands: their code runs, their commands and options exist."""
+"""The pages: their links lead somewhere, their code runs, and the commands and options that they name exist."""
 
 from __future__ import annotations
 
 import ast
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from avtorch.cli import main
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
-PAGES = ("diagnosis.md", "compare.md", "fleet.md", "followers.md", "paper.md", "watch.md")
-ALL = [DOCS.parent / "README.md", *sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("effects/*.md"))]
+ROOT = Path(__file__).resolve().parents[1]
+DOCS, BENCHMARKS = ROOT / "docs", ROOT / "benchmarks"
+OF_DOCS = [*sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("effects/*.md"))]
+ALL = [ROOT / "README.md", ROOT / "CHANGELOG.md", *OF_DOCS, *sorted(BENCHMARKS.rglob("*.md"))]
 # with tests of their own: tests/gap/simulator/test_own_effect_page.py, tests/test_gallery.py, tests/test_tutorial.py
 ELSEWHERE = ("gallery.md", "own-effect.md", "tutorial.md")
-CODE = [p.name for p in ALL[1:] if "```python" in p.read_text(encoding="utf-8") and p.name not in ELSEWHERE]
-SLOW = ("coming-from.md", "compare.md", "diagnosis.md", "fleet.md", "fmu.md")
-SLOW += ("followers.md", "pedals.md", "simulators.md")
-COMMANDS = {"diagnosis.md": "diagnose", "followers.md": "diagnose"}
+CODE = [p.name for p in OF_DOCS if "```python" in p.read_text(encoding="utf-8") and p.name not in ELSEWHERE]
+QUICK = ("paper.md",)
+COMMANDS = {
+    "diagnosis.md": ("diagnose",),
+    "estimation.md": ("estimate", "stability"),
+    "fleet.md": ("fleet", "watch", "check"),
+    "logs.md": ("check", "estimate", "diagnose"),
+    "paper.md": ("paper",),
+    "simulators.md": ("diagnose", "compare", "check-simulator"),
+}
+
+
+def named(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
 
 
 def blocks(page: str, language: str) -> list[str]:
@@ -26,7 +38,7 @@ def blocks(page: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.S | re.M)
 
 
-@pytest.mark.parametrize("page", [pytest.param(p, marks=pytest.mark.slow if p in SLOW else []) for p in CODE])
+@pytest.mark.parametrize("page", [pytest.param(p, marks=[] if p in QUICK else pytest.mark.slow) for p in CODE])
 def test_code_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict = {"__name__": "page"}
@@ -36,15 +48,29 @@ def test_code_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         exec(compile(block, page, "exec", dont_inherit=True), names)
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize("page", COMMANDS)
 def test_options_exist(page: str, capsys: pytest.CaptureFixture[str]) -> None:
     text = re.sub(r"`python -m benchmarks[^`]*`", "", (DOCS / page).read_text(encoding="utf-8"))  # options of their own
-    assert main([COMMANDS.get(page, page.removesuffix(".md")), "--help"]) == 0
+    for command in COMMANDS[page]:
+        assert main([command, "--help"]) == 0
     known = set(re.findall(r"--[a-z][a-z-]*", capsys.readouterr().out))
     assert set(re.findall(r"(?<!-)--[a-z][a-z-]*", text)) <= known
 
 
-@pytest.mark.parametrize("page", ALL, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", ALL, ids=named)
+def test_benchmarks_that_are_named_exist(page: Path) -> None:
+    """Each is a module of `benchmarks`, and each of its options stands in its source."""
+    for module, options in re.findall(r"python -m (benchmarks[\w.]*)([^`\n]*)", page.read_text(encoding="utf-8")):
+        spec = find_spec(module)
+        assert spec is not None, module
+        assert spec.origin is not None
+        path = Path(spec.origin)
+        source = (path.with_name("__main__.py") if path.name == "__init__.py" else path).read_text(encoding="utf-8")
+        for option in re.findall(r"--([a-z][a-z-]*)", options):
+            assert re.search(rf"[\"'](?:--)?{option}[\"']", source) or f"{option}=" in source, f"{module} --{option}"
+
+
+@pytest.mark.parametrize("page", ALL, ids=named)
 def test_links_lead_somewhere(page: Path) -> None:
     """As a code host follows them; what the built site makes of them is checked when it is built."""
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.S | re.M)
@@ -55,13 +81,13 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert not mark or mark[1:] in [re.sub(r"[^\w\- ]", "", t.lower()).replace(" ", "-") for t in titles], mark
 
 
-@pytest.mark.parametrize("page", ALL, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", ALL, ids=named)
 def test_tests_that_are_named_exist(page: Path) -> None:
     """Every promise names a test that enforces it."""
-    named = re.findall(r"\b(tests/[\w/]+\.py)(?:::(\w+))?", page.read_text(encoding="utf-8"))
-    assert named or page.name != "trust.md"
-    for path, name in named:
-        there = ast.parse((DOCS.parent / path).read_text(encoding="utf-8")).body
+    found = re.findall(r"\b(tests/[\w/]+\.py)(?:::(\w+))?", page.read_text(encoding="utf-8"))
+    assert found or page.name != "trust.md"
+    for path, name in found:
+        there = ast.parse((ROOT / path).read_text(encoding="utf-8")).body
         assert not name or name in [x.name for x in there if isinstance(x, ast.FunctionDef)], f"{path}::{name}"
 
 
@@ -69,4 +95,15 @@ def test_reference_names_only_what_exists() -> None:
     text = (DOCS / "reference.md").read_text(encoding="utf-8")
     folders = re.findall(r"^\| \[?`([^`]+)`", text, re.M)
     assert folders
-    assert not [folder for folder in folders if not (DOCS.parent / folder).is_dir()]
+    assert not [folder for folder in folders if not (ROOT / folder).is_dir()]
+    for name, path in re.findall(r"`(\w+)` (?:and `\w+` )?in \[`[^`]+`\]\(\.\./([^)]+)\)", text):
+        source = (ROOT / path).read_text(encoding="utf-8")
+        assert re.search(rf"\b{name}\b", source), f"{path}: {name}"
+
+
+def test_the_pages_can_be_read_in_an_afternoon() -> None:
+    def words(pages: list[Path]) -> int:
+        return sum(len(page.read_text(encoding="utf-8").split()) for page in pages)
+
+    assert words(OF_DOCS) <= 30_000
+    assert words([ROOT / "README.md"]) <= 700

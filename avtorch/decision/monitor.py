@@ -122,7 +122,7 @@ class Monitor:
     detector, per excited window. arl: in-control average run length of each chart [excited windows]. inflation: ratio
     of window-to-window spread to posterior SD, 1 for a posterior of the right width. unevenness: SDs, as shares of T_L
     and K_L, by which a sound vehicle differs from window to window: divergences and charts without it alarm on any car
-    that is not GLVD to a per cent (0.1 and 0.03 kept them quiet, docs/detectors.md). dead_time [s]: of the vehicle,
+    that is not GLVD to a per cent (0.1 and 0.03 kept them quiet, benchmarks/detectors). dead_time [s]: of the vehicle,
     number or (scenario,). link_delay [s]: of the leader's acceleration where it is fed forward. Raises `InputError` for
     unknown detectors and numbers out of range.
 

@@ -1,4 +1,4 @@
-"""Settings of the sampler, with the reasons for their defaults in docs/sgld.md."""
+"""Settings of the sampler, with the reasons for their defaults in benchmarks/bias/README.md."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Options that the paper names but does not work out, each with its figures (docs/options.md)."""
+"""Options that the paper names but does not work out, each with its figures (README.md)."""

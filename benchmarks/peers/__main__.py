@@ -2,7 +2,7 @@
 
     python -m benchmarks.peers [--only NAME,...] [--windows 5] [--batch 1000] [--quick] [--markdown] [--json FILE]
 
-Tables go to standard output, progress to standard error. docs/benchmarks.md describes each peer and its settings.
+Tables go to standard output, progress to standard error. README.md describes each peer and its settings.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
 """Pages are written for a code host, as plain Markdown with relative links. Here the site learns to follow them.
 
-A link to a file of `../avtorch` leads to its listing on the site, a link to a package to its page of the reference, and
-one to the `README.md` of the root or of a folder of `OUTSIDE` to the copy made here, one to a notebook to its page.
+A link to a file of `../avtorch` leads to its listing on the site, a link to a package to its page of the reference, one
+to a page of `OUTSIDE` to the copy made here, and one to a notebook to its page.
 """
 
 from __future__ import annotations
 
+import posixpath
 import re
 from html.parser import HTMLParser
 from pathlib import Path
-from posixpath import normpath
 from urllib.parse import unquote, urlsplit
 
 import reference
@@ -18,19 +18,27 @@ from reference import FOLDER
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
-# Pages that lie outside: their folder beside the root, and what they are called here.
-OUTSIDE = {"": "readme.md", "notebooks/": "notebooks.md", "benchmarks/blindtest/": "blindtest.md"}
+ROOT = Path(__file__).resolve().parents[2]
+# Pages that lie outside, by their path from the root, and what they are called here.
+OUTSIDE = {"README.md": "readme.md", "notebooks/README.md": "notebooks.md"} | {
+    page: page.replace("/README.md", ".md").replace("/", ".")
+    for page in sorted(p.relative_to(ROOT).as_posix() for p in (ROOT / "benchmarks").rglob("*.md"))
+}
 
 LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)#\s]+)")
 
 
 def outside(app: Sphinx) -> None:
-    """READMEs as pages: their links are those of their folders."""
-    root, made = Path(app.srcdir).parent, Path(app.srcdir) / FOLDER
+    """Pages of other folders: their links are those of their folders."""
+    made = Path(app.srcdir) / FOLDER
     made.mkdir(exist_ok=True)
-    for folder, page in OUTSIDE.items():
-        text = (root / folder / "README.md").read_text(encoding="utf-8")
-        text = LINK.sub(lambda m, folder=folder: f"../../{normpath(folder + m[1])}", text)
+    for old in made.glob("*.md"):
+        if old.name not in OUTSIDE.values():
+            old.unlink()
+    for path, page in OUTSIDE.items():
+        text = (ROOT / path).read_text(encoding="utf-8")
+        folder = posixpath.dirname(path)
+        text = LINK.sub(lambda m, folder=folder: f"../../{posixpath.normpath(posixpath.join(folder, m[1]))}", text)
         target = made / page
         if not target.exists() or target.read_text(encoding="utf-8") != text:
             target.write_text(text, encoding="utf-8")
@@ -46,9 +54,9 @@ def read(app: Sphinx, docname: str, content: list[str]) -> None:
 
 
 def on_site(link: str, up: str) -> str:
-    readme = re.fullmatch(r"(?:\.\./)+(notebooks/|benchmarks/blindtest/)?README\.md(#.*)?", link)
-    if readme:
-        return f"{up}{FOLDER}/{OUTSIDE[readme[1] or '']}{readme[2] or ''}"
+    path = re.sub(r"^(?:\.\./)+", "", link)
+    if path != link and path in OUTSIDE:
+        return f"{up}{FOLDER}/{OUTSIDE[path]}"
     notebook = re.fullmatch(r"(?:\.\./)+(notebooks/\w+\.ipynb)", link)
     if notebook:
         return f"{up}{FOLDER}/{notebook[1]}"

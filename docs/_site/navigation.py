@@ -14,6 +14,7 @@ TREE = "\n\n```{{toctree}}\n:hidden:\n:glob:\n{}\n{}\n```\n"
 BELOW = {
     "effects": TREE.format("", "effects/*"),
     f"{FOLDER}/notebooks": TREE.format("", "notebooks/*"),
+    f"{FOLDER}/benchmarks": TREE.format("", "benchmarks.*"),
     "reference": TREE.format("", f"{FOLDER}/commands\n{FOLDER}/avtorch*"),
 }
 

@@ -170,7 +170,7 @@ def test_aims_are_those_of_the_page_in_their_order() -> None:
     most["blackjax-nuts-whitened"] = 7.52
     found = aims([row(*of, 5) for of in one.items()], [row(*of, 300) for of in many.items()], None)
     found += aims([], [row(*of, 1000) for of in most.items()], None)
-    page = (Path(__file__).resolve().parents[2] / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    page = Path(command.__file__).with_name("README.md").read_text(encoding="utf-8")
     section = page.partition("## With the walk compiled")[2].partition("\n## ")[0].partition("| aim |")[2]
     rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("| ")]
     assert [(aim, verdict) for aim, _, verdict in found] == [(aim, verdict) for aim, _, verdict in rows]

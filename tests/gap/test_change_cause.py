@@ -75,7 +75,7 @@ def _pair(case: Case, seed: int, both: Sequence[Effect] = ()) -> tuple[Log, Log]
     "which", ["gain", *(pytest.param(x, marks=pytest.mark.slow) for x in ("bias", "resistance", "delay"))]
 )
 def test_a_change_is_named_with_its_size(which: str, rotating_seed: int) -> None:
-    """Each is larger than one that was named in ten of ten pairs of such drives (docs/compare.md)."""
+    """Each is larger than one that was named in ten of ten pairs of such drives (docs/simulators.md)."""
     case = CASES[which]
     found = _cause(*_pair(case, rotating_seed))
     assert found.answer in ("named", "ambiguous")
@@ -95,7 +95,7 @@ def test_a_change_is_named_with_its_size(which: str, rotating_seed: int) -> None
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_one_car_names_no_cause(rotating_seed: int) -> None:
-    """One in ten at most may name a cause, or find something unexplained: measured less often (docs/compare.md)."""
+    """One in ten at most may name a cause, or find something unexplained: measured less often (docs/simulators.md)."""
     pairs = 12
     seeds = np.random.default_rng(rotating_seed).integers(2**31, size=(pairs, 2)).tolist()
     found = [_cause(*(log_of(seconds=60.0, seed=seed) for seed in two)) for two in seeds]

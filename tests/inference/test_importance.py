@@ -112,7 +112,7 @@ def test_a_clock_that_jitters_changes_the_route_and_not_the_law(rotating_seed: i
     # a density without the neighbour: all draws by the exact filter
     density.approximation = lambda: density  # type: ignore[method-assign]
     long = weighted_draws(density, ImportanceSettings(draws=1024, enough=2000.0), generator=generator)
-    # of lag and gain; along a ridge between two noises one window of 75 misses a part (docs/estimators.md)
+    # of lag and gain; along a ridge between two noises one window of 75 misses a part (benchmarks/estimators.md)
     # shares below the medians: a tail may be so heavy that a mean has no error by the number of draws
     middle = torch.stack(
         [_median(z, weight) for z, weight in zip(long.z[:, 0, :2].T, long.weight.T.expand(2, -1), strict=True)]

@@ -18,7 +18,7 @@ AGAINST_SGLD = (
     "Importance sampling in place of SGLD, whose gradients are dear here: on 24 windows its means lay within 0.08 SD "
     "of a long reference in 95 %, SGLD's within 0.18."
 )
-"""The estimator's error beside SGLD's, for answers; `docs/estimators.md` has the table."""
+"""The estimator's error beside SGLD's, for answers; `benchmarks/estimators.md` has the table."""
 
 FIRST = ImportanceSettings()
 WIDER = ImportanceSettings(draws=512, rounds=8, degrees=3, width=1.3)
