@@ -19,7 +19,9 @@ ALL = [ROOT / "README.md", ROOT / "CHANGELOG.md", *OF_DOCS, *sorted(BENCHMARKS.r
 ELSEWHERE = ("gallery.md", "own-effect.md", "tutorial.md")
 CODE = [p.name for p in OF_DOCS if "```python" in p.read_text(encoding="utf-8") and p.name not in ELSEWHERE]
 QUICK = ("paper.md",)
+READ, ACT = ("check", "estimate", "diagnose", "compare", "check-simulator"), ("fleet", "watch", "stability", "run")
 COMMANDS = {
+    "../README.md": (*READ, *ACT, "validate", "paper"),
     "diagnosis.md": ("diagnose",),
     "estimation.md": ("estimate", "stability"),
     "fleet.md": ("fleet", "watch", "check"),

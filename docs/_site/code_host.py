@@ -54,8 +54,8 @@ def read(app: Sphinx, docname: str, content: list[str]) -> None:
 
 
 def on_site(link: str, up: str) -> str:
-    path = re.sub(r"^(?:\.\./)+", "", link)
-    if path != link and path in OUTSIDE:
+    path = re.sub(r"^(?:\.\./)+", "", posixpath.normpath(link))
+    if link.startswith("../") and path in OUTSIDE:
         return f"{up}{FOLDER}/{OUTSIDE[path]}"
     notebook = re.fullmatch(r"(?:\.\./)+(notebooks/\w+\.ipynb)", link)
     if notebook:
