@@ -10,19 +10,152 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
+from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
+from avtorch.errors import InputError
 from avtorch.inference.excitation import ExcitationRule
-from avtorch.inference.sequential import Mode
-from avtorch.validation.calibration import sbc, sbc_loop, sbc_quadrature
-from avtorch.validation.ranks import LEVELS, RankCalibration
+from avtorch.inference.jerk import JerkDensity
+from avtorch.inference.priors import Prior
+from avtorch.inference.sampler import sample
+from avtorch.inference.sampler_settings import SamplerSettings
+from avtorch.inference.sequential import Mode, SequentialInference
+from avtorch.validation.calibration import (
+    LEVELS,
+    RankCalibration,
+    batches,
+    check_sizes,
+    drawn_windows,
+    joined,
+    sbc_quadrature,
+)
+from avtorch.validation.simulation import Amplitude, statistics
 
 LEVEL, SEED = 0.01, 20240601
 STRONG, WEAK, VARIED = 1.0, 0.1, (0.1, 2.0)
 NAMES = ("T_L", "K_L", "sigma")
 #: Replications at which the power of the tests is measured.
 SIZES = (250, 500, 1000, 2000, 4000)
+
+
+Sampler = Callable[[JerkDensity, torch.Generator], tuple[Tensor, Tensor]]
+"""Draws ``(draw, window, parameter)``, evenly usable once thinned, and where they can be used, ``(window,)`` bool."""
+
+
+def sgld(settings: SamplerSettings | None = None) -> Sampler:
+    """The sampler under test: Algorithm 1 by :func:`sample`."""
+
+    def draw(density: JerkDensity, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        posterior = sample(density, settings, generator=generator)
+        return posterior.flat, posterior.converged
+
+    return draw
+
+
+def sbc(
+    replications: int = 4000,
+    *,
+    rows: int = 200,
+    amplitude: Amplitude = VARIED,
+    prior: Prior | None = None,
+    sampler: Sampler | None = None,
+    draws: int = 99,
+    inflate: float = 1.0,
+    seed: int = 0,
+    batch: int = 500,
+) -> RankCalibration:
+    """Calibration of a single window's posterior.
+
+    Args:
+        replications: truths drawn from the prior, each with a window of its own.
+        rows, amplitude: length [samples of 10 ms] and excitation [m/s^2] of the windows, see :func:`statistics`.
+        prior: of ``z = log(T_L, K_L, sigma)``; the library's first prior by default.
+        sampler: what is tested; SGLD with default settings by default.
+        draws: draws that a rank counts, spread over chains and time to be nearly independent.
+        inflate: stretch the draws about their mean in ``z`` by this factor, a fault that the tests must detect.
+        batch: windows sampled at once.
+
+    Raises:
+        InputError: for ``draws`` that 20 bins do not divide, or ``inflate``, ``replications``, ``batch`` not positive.
+    """
+    check_sizes(replications, draws, inflate, batch)
+    sampler = sgld() if sampler is None else sampler
+    own = torch.Generator().manual_seed(_other(seed))
+    parts = []
+    for density, truth in drawn_windows(replications, batch, rows, amplitude, prior, seed):
+        posterior, usable = sampler(density, own)
+        parts.append(RankCalibration.of(density, truth, posterior, usable, draws=draws, inflate=inflate))
+    return joined(parts)
+
+
+def _other(seed: int, number: int = 0) -> int:
+    """A seed for the sampler, whose noise must not be that of the windows."""
+    return (seed + 1) * 1_000_003 + number
+
+
+def sbc_loop(
+    replications: int = 4000,
+    *,
+    windows: int = 5,
+    mode: Mode = "posterior",
+    truth: Literal["constant", "claimed"] | None = None,
+    rows: int = 200,
+    amplitude: Amplitude = VARIED,
+    rule: ExcitationRule | None = None,
+    draws: int = 99,
+    inflate: float = 1.0,
+    seed: int = 0,
+    batch: int = 500,
+    **loop: Any,
+) -> list[RankCalibration]:
+    """Calibration of the sequential loop after each of its windows; replications are its vehicles.
+
+    With ``truth="constant"`` a vehicle is drawn once from the first prior and stays. Ranks are then uniform after every
+    window if the loop passes on all information, as ``posterior`` mode claims up to its normal approximation. With
+    ``truth="claimed"`` each window's vehicle is drawn from the loop's current prior for it, as if vehicles changed the
+    way that ``lambda`` and ``forgetting`` assume (posterior SBC); ranks are then uniform if every update is right given
+    its prior. A constant truth contradicts the assumption of these modes, and its ranks are not uniform: the loop's
+    posteriors are too wide.
+
+    Args:
+        truth: by default ``"constant"`` in ``posterior`` mode, else ``"claimed"``.
+        rule: windows that it finds not excited are not used; by default all are.
+        loop: further arguments of :class:`SequentialInference`.
+
+    Returns:
+        One calibration a window, of the vehicles that used it.
+
+    Raises:
+        InputError: as :func:`sbc`, or for ``truth`` of another name.
+    """
+    check_sizes(replications, draws, inflate, batch)
+    if truth not in (None, "constant", "claimed"):
+        raise InputError(f"truth: found {truth!r}, need 'constant' or 'claimed'")
+    constant = mode == "posterior" if truth is None else truth == "constant"
+    generator = torch.Generator().manual_seed(seed)
+    parts: list[list[RankCalibration]] = [[] for _ in range(windows)]
+    for number, count in enumerate(batches(replications, batch)):
+        kept = 10 * (draws + 1) - 1
+        inference = SequentialInference(vehicles=count, mode=mode, kept=kept, seed=_other(seed, number), **loop)
+        z = inference.prior().sample(1, count, generator=generator)[0]
+        for window in range(windows):
+            prior = inference.prior()
+            if not constant:
+                z = prior.sample(1, count, generator=generator)[0]
+            seen = statistics(z, rows=rows, amplitude=amplitude, generator=generator)
+            excited = torch.ones(count, dtype=torch.bool) if rule is None else rule(seen, rows)
+            belief = inference.update(lambda index, own, seen=seen: JerkDensity(seen.select(index), own), excited)
+            used = excited.nonzero().squeeze(-1)
+            density = JerkDensity(seen.select(used), prior.select(used))
+            parts[window].append(
+                RankCalibration.of(
+                    density, z[used], belief.draws[:, used], belief.converged[used], draws=draws, inflate=inflate
+                )
+            )
+    return [joined(part) for part in parts]
 
 
 def verdict(p_value: float) -> str:

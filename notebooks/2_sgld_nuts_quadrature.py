@@ -198,7 +198,7 @@ print("widest SD ratio by batch:", ", ".join(f"{n}: {max(x):.2f}" for n, x in wi
 # %% [markdown]
 # Ten points at a time make the posterior much too wide, as the formula predicts. Windows of a few hundred points gain
 # nothing from minibatches: the whole window's likelihood is six sums, whatever its length, so avtorch uses all points
-# in every step. Where points are too many, use `avtorch.inference.ControlVariates`.
+# in every step.
 #
 # ## A step that falls too fast
 #

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.inference.latent import LatentDensity
-from avtorch.inference.latent_excitation import latent_excitation
+from avtorch.inference.latent_form import latent_excitation
 from avtorch.inference.latent_window import LatentWindow
 from avtorch.inference.map import Mode, find_mode
 from avtorch.io.log import Log

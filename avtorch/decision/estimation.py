@@ -21,8 +21,7 @@ from avtorch.decision.dead_time import InferredDeadTime, infer_dead_time
 from avtorch.decision.kept_windows import KeptWindows, Place, estimated_work
 from avtorch.decision.monitor import Monitor
 from avtorch.decision.settings import Setting
-from avtorch.decision.watch import Watch, WatchedWindow
-from avtorch.decision.window_frame import window_frame
+from avtorch.decision.watch import Watch, WatchedWindow, window_frame
 from avtorch.display import Card, Displayed, Frame
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from avtorch.decision.settings import Setting
-from avtorch.decision.watch import WatchedWindow
-from avtorch.decision.window_frame import window_frame
+from avtorch.decision.watch import WatchedWindow, window_frame
 from avtorch.display import Card, Displayed, Frame
 from avtorch.vehicle.block import Block
 

@@ -28,7 +28,6 @@ import torch
 from torch import Tensor
 
 from avtorch.decision.grid import Candidates, Grid
-from avtorch.decision.reasons import sentences
 from avtorch.decision.replay import History, Prediction, replay
 from avtorch.decision.settings import Number, Setting
 from avtorch.errors import InputError
@@ -199,7 +198,7 @@ class Strategist:
             predicted=predicted,
             strategies=strategies,
             changes=chosen.differs(current),
-            why=sentences(
+            why=self._reasons(
                 chosen,
                 current=current,
                 default=default,
@@ -210,13 +209,60 @@ class Strategist:
                 predicted=predicted,
                 asked=asked,
                 seconds=history.seconds,
-                required=self.required,
-                most_clipped=self.most_clipped,
             ),
             interim=interim,
             p_interim=self.probability(interim, T_L, K_L),
             driver_delay_s=asked * self.driver_delay,
         )
+
+    def _reasons(
+        self,
+        chosen: Setting,
+        *,
+        current: Setting,
+        default: Setting,
+        strategies: list[set[int]],
+        sufficient: Tensor,
+        p_string_stable: Tensor,
+        p_deaf: Tensor,
+        predicted: Prediction,
+        asked: Tensor,
+        seconds: float,
+    ) -> list[str]:
+        """Why a setting was chosen, in one plain sentence per scenario; tensors are (scenario,).
+
+        `p_deaf`: P(string stable) if the leader's acceleration is no longer received. `asked`: the driver is asked to
+        set the gap. `seconds` [s] of the past over which `predicted` was replayed.
+        """
+        out = []
+        for i, used in enumerate(strategies):
+            now, was = chosen.as_dict(i), current.as_dict(i)
+            steps = []
+            if 1 in used:
+                steps.append(
+                    f"lower level models T {now['T_hat']:.2f} s, K {now['K_hat']:.2f} and targets {now['T_d']:.2f} s"
+                )
+            if 2 in used:
+                verb = "driver asked for a time gap of" if bool(asked[i]) else "time gap"
+                steps.append(f"{verb} {now['time_gap_s']:g} s instead of {float(default.time_gap[i]):g} s")
+            if 3 in used:
+                steps.append("gains " + ", ".join(f"{k:g}" for k in now["gains"]))
+            if 4 in used:
+                lost = f"P(string stable) {float(p_deaf[i]):.2f} if the link is lost"
+                steps.append(f"leader's acceleration fed forward with k_f {now['feedforward']:g} ({lost})")
+            what = "; ".join(steps) if steps else "default setting"
+            if now == was:
+                what = f"setting in force stays ({what})"
+            clipped = 100.0 * float(predicted.clipped_share[i])
+            past = f"{clipped:.1f} % of commands clipped in a replay of the past {seconds:.0f} s"
+            result = f"P(string stable) {float(p_string_stable[i]):.2f}, {past}"
+            if bool(sufficient[i]):
+                out.append(f"least intrusive sufficient setting: {what} ({result})")
+            else:
+                least, most = f"{self.required:g}", f"{100 * self.most_clipped:g}"
+                missed = f"keeps P(string stable) at {least} with {most} % of commands clipped or less"
+                out.append(f"no setting of the grid {missed}; the best one: {what} ({result})")
+        return out
 
 
 class _Search:

@@ -11,8 +11,6 @@ Example:
 """
 
 from avtorch.inference.belief import Belief
-from avtorch.inference.conjugate import Conjugate, sample_conjugate
-from avtorch.inference.control_variates import ControlVariates
 from avtorch.inference.density import (
     ConstrainedDensity,
     Density,
@@ -24,32 +22,21 @@ from avtorch.inference.excitation import ExcitationRule
 from avtorch.inference.form import Form, JerkForm, WindowLikelihood
 from avtorch.inference.jerk import JerkDensity, JerkPoints, JerkStatistics, jerk_log_likelihood
 from avtorch.inference.map import Mode, find_mode
-from avtorch.inference.population import PopulationDensity, PopulationMargin
+from avtorch.inference.population import PopulationMargin
 from avtorch.inference.posterior import Posterior, nested_rhat
 from avtorch.inference.quadrature import Quadrature, integrate
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings
-from avtorch.inference.second_order import (
-    PositionLagDensity,
-    SpeedLagDensity,
-    default_position_lag_prior,
-    default_speed_lag_prior,
-)
-from avtorch.inference.second_order_form import PositionLagForm, SpeedLagForm
 from avtorch.inference.sequential import SequentialInference
-from avtorch.inference.sghmc import SGHMC
 from avtorch.inference.sgld import SGLD
 from avtorch.inference.stream import BeliefStream, Window
 from avtorch.inference.torch_density import TorchDensity
 
 __all__ = [
-    "SGHMC",
     "SGLD",
     "Belief",
     "BeliefStream",
-    "Conjugate",
     "ConstrainedDensity",
-    "ControlVariates",
     "Density",
     "ExcitationRule",
     "Form",
@@ -58,28 +45,20 @@ __all__ = [
     "JerkPoints",
     "JerkStatistics",
     "Mode",
-    "PopulationDensity",
     "PopulationMargin",
-    "PositionLagDensity",
-    "PositionLagForm",
     "Posterior",
     "Quadrature",
     "SamplerSettings",
     "ScoredDensity",
     "SelectableDensity",
     "SequentialInference",
-    "SpeedLagDensity",
-    "SpeedLagForm",
     "SubsampledDensity",
     "TorchDensity",
     "Window",
     "WindowLikelihood",
-    "default_position_lag_prior",
-    "default_speed_lag_prior",
     "find_mode",
     "integrate",
     "jerk_log_likelihood",
     "nested_rhat",
     "sample",
-    "sample_conjugate",
 ]

@@ -48,10 +48,11 @@ class Form(Protocol):
     """A form of the log density: its columns, its parameters, and the likelihood of a window of rows.
 
     Example:
-        >>> from avtorch.inference import Form, JerkForm, SpeedLagForm
-        >>> forms: list[Form] = [JerkForm(), SpeedLagForm()]
-        >>> [form.names for form in forms]
-        [('T_L', 'K_L', 'sigma'), ('T_V', 'K_V', 'sigma')]
+        >>> from avtorch.inference import Form, JerkForm
+        >>> from avtorch.inference.latent_form import LatentForm
+        >>> forms: list[Form] = [JerkForm(), LatentForm(accel=False, speed=True)]
+        >>> [form.columns for form in forms]
+        [('accel_cmd', 'accel', 'jerk'), ('accel_cmd', 'speed')]
     """
 
     @property

@@ -5,27 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.kernel_loading import Unavailable, load_kernels
-from avtorch.inference.latent_compiled import compiled_values
-from avtorch.inference.latent_filter import latent_log_likelihood
-from avtorch.inference.latent_rows import row_values
-from avtorch.inference.latent_steady import EvenRows, steady_log_likelihood
-from avtorch.inference.latent_values import steady_values
+from avtorch.inference.latent_model import ACCEL_SD0, SPEED_SD0, latent_log_likelihood
 from avtorch.inference.latent_window import LatentWindow
 from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior, prior_on
 
 #: Rows count as even while their times are this close to an even grid: a quarter of a step, and 2.5 ms. The error in
-#: speed is 2.5 mm/s per m/s², below the noise of a wheel speed. Other rows use the row-by-row filter, which is exact
-#: for any times and slower by the number of rows.
+#: speed is 2.5 mm/s per m/s², below the noise of a wheel speed. For even rows the model is discretised once, for others
+#: at every row.
 EVEN_STEPS, EVEN_S = 0.25, 0.0025
 #: Floor added in squares to the sensors' noise parameters [m/s, m/s²]: no sensor in a car resolves less. Without it the
 #: noise fitted to a noise-free simulated log would shrink until the filter loses all digits.
 FINEST = 1e-4
+#: Of the log parameters, for central differences of the log density: what they cut off is some 1e-9 of the third
+#: derivative, and a round-off of 1e-9 nats becomes 5e-6.
+SPACING = 1e-4
 #: Medians and log SDs of the noise parameters, for a test car and a production car alike.
 #: process_noise [m/s²/√s], the actuator's own roughness: at a lag of 0.3 s the median makes 0.06 m/s², and 95 %
 #: lie within a factor 7. road_noise [m/s/√s]: body vibration; the median makes 1 mm/s from row to row at 100 Hz.
@@ -56,50 +56,67 @@ def latent_names(*, accel: bool, speed: bool) -> tuple[str, ...]:
 
 
 def run_log_likelihood(
-    p: dict[str, Float[Tensor, "*draw run"]], runs: LatentWindow, even: EvenRows | None
+    p: dict[str, Float[Tensor, "*draw run"]], runs: LatentWindow, steps: Float[Tensor, " run"] | None
 ) -> Float[Tensor, "*draw run"]:
-    """Log likelihood ``(..., run)`` of parameters by name, each ``(..., run)``; ``even`` is ``even_rows(runs)``.
+    """Log likelihood ``(..., run)`` of parameters by name, each ``(..., run)``; ``steps`` is ``even_steps(runs)``.
 
-    Where no gradient is asked for, the same number comes from the routes without a graph, on the processor.
+    Where a gradient is asked for by the filter in torch, otherwise the same number by the compiled one.
     """
     noise = {name: (p[name].square() + FINEST**2).sqrt() for name in ("accel_noise", "speed_noise") if name in p}
     noise |= {name: p[name] for name in ("road_noise",) if name in p}
     five = (p["T_L"], p["K_L"], p["process_noise"], p["coloured_sd"], p["coloured_time"])
-    # the routes without a graph are NumPy's or compiled
-    elsewhere = runs.time.device.type != "cpu"
-    differentiated = elsewhere or (torch.is_grad_enabled() and any(x.requires_grad for x in (*five, *noise.values())))
-    if not differentiated and not isinstance(kernels := load_kernels("latent_kernels"), Unavailable):
-        return compiled_values(kernels, *five, runs, even, **noise)
-    if even is not None:
-        return (steady_log_likelihood if differentiated else steady_values)(*five, even, **noise)
-    if not differentiated:
-        return _row_by_row(five, runs, noise)
-    measured = {"accel": runs.accel, "speed": runs.speed}
-    return latent_log_likelihood(*five, runs.time, runs.u, mask=runs.mask, **measured, **noise)
+    if not (torch.is_grad_enabled() and any(x.requires_grad for x in (*five, *noise.values()))):
+        values = compiled_log_likelihood(*five, runs, steps, **noise)
+        if values is not None:
+            return values
+    time = runs.time
+    if steps is not None:
+        time = steps[:, None] * torch.arange(time.shape[1], dtype=torch.float64, device=time.device)
+    return latent_log_likelihood(*five, time, runs.u, mask=runs.mask, accel=runs.accel, speed=runs.speed, **noise)
 
 
-def _row_by_row(five: Sequence[Tensor], runs: LatentWindow, noise: dict[str, Tensor]) -> Tensor:
-    lead, counts = five[0].shape[:-1], runs.mask.sum(-1).tolist()
-    signals = {name: x for name, x in (("accel", runs.accel), ("speed", runs.speed)) if x is not None}
-    same = len(counts) > 1 and all(bool((x == x[:1]).all()) for x in (runs.time, runs.u, runs.mask))
-    columns = []
-    # runs under the same clock and command are taken together, the runs as further draws
-    for run in [slice(0, len(counts))] if same else [slice(r, r + 1) for r in range(len(counts))]:
-        rows = counts[run.start]
-        own = {name: x[..., run].reshape(-1) for name, x in noise.items()}
-        T_L, K_L, rough, sd, slow = (x[..., run].reshape(-1) for x in five)
-        measured = {
-            name: x[run, :rows].expand(*lead, -1, -1).reshape(-1, rows) if same else x[run, :rows]
-            for name, x in signals.items()
-        }
-        time, u = runs.time[run.start, :rows], runs.u[run.start, :rows]
-        values = row_values(T_L, K_L, rough, sd, slow, time, u, **measured, **own)
-        columns.append(values.reshape(*lead, -1))
-    return torch.cat(columns, -1)
+@torch.no_grad()
+def compiled_log_likelihood(
+    T_L: Float[Tensor, "*draw run"],
+    K_L: Float[Tensor, "*draw run"],
+    process_noise: Float[Tensor, "*draw run"],
+    coloured_sd: Float[Tensor, "*draw run"],
+    coloured_time: Float[Tensor, "*draw run"],
+    runs: LatentWindow,
+    steps: Float[Tensor, " run"] | None,
+    *,
+    accel_noise: Float[Tensor, "*draw run"] | None = None,
+    speed_noise: Float[Tensor, "*draw run"] | None = None,
+    road_noise: Float[Tensor, "*draw run"] | None = None,
+) -> Float[Tensor, "*draw run"] | None:
+    """Log likelihood ``(..., run)`` [nats] with no gradient, on the processor; NaN where digits are lost.
+
+    Arguments as of `latent_log_likelihood`; None where nothing can be compiled here.
+    """
+    kernels = load_kernels("latent_kernels")
+    if isinstance(kernels, Unavailable):
+        return None
+    zero, device = torch.zeros_like(T_L), T_L.device
+    six = (T_L, K_L, process_noise, zero if road_noise is None else road_noise, coloured_sd, coloured_time)
+    two = (zero if x is None else x.square() for x in (speed_noise, accel_noise))
+    given = torch.stack((*six, *two)).reshape(8, -1, T_L.shape[-1]).movedim(-1, 0).cpu().contiguous().numpy()
+    rows = runs.to("cpu")
+    speed = None if speed_noise is None or rows.speed is None else (rows.speed - rows.speed[:, :1]).numpy()
+    accel = None if accel_noise is None or rows.accel is None else rows.accel.numpy()
+    time, u, none = rows.time.numpy(), rows.u.numpy(), np.empty(0)
+    found = np.empty((len(u), given.shape[2]))
+    for run, count in enumerate(rows.mask.sum(-1).tolist()):
+        dt = np.diff(time[run, :count]) if steps is None else np.full(count - 1, float(steps[run]))
+        signals = (none if x is None else x[run, :count] for x in (speed, accel))
+        parameters = (given[run, :6], given[run, 6:], SPEED_SD0, ACCEL_SD0)
+        kernels.filtered(found[run], *parameters, dt, steps is not None, u[run, :count], *signals)
+    return torch.from_numpy(found.T.copy()).reshape(T_L.shape).to(device)
 
 
-def even_rows(runs: LatentWindow, *, most_steps: float = EVEN_STEPS, most_s: float = EVEN_S) -> EvenRows | None:
-    """The layout of the fast route, or None where a row of some run is further off an even grid than both bounds."""
+def even_steps(
+    runs: LatentWindow, *, most_steps: float = EVEN_STEPS, most_s: float = EVEN_S
+) -> Float[Tensor, " run"] | None:
+    """The step ``(run,)`` [s] of even rows, or None where a row is further off its run's grid than both bounds."""
     count = runs.mask.sum(-1)
     index = torch.arange(runs.time.shape[1], dtype=torch.float64, device=runs.time.device)
     last = runs.time.gather(1, (count - 1)[:, None])[:, 0]
@@ -107,16 +124,14 @@ def even_rows(runs: LatentWindow, *, most_steps: float = EVEN_STEPS, most_s: flo
     # A run of a single row has no step; any value will do.
     dt = torch.where(count > 1, dt, dt[count > 1].median() if bool((count > 1).any()) else 0.01)
     off = (runs.time - runs.time[:, :1] - dt[:, None] * index).abs() * runs.mask
-    if bool((off > (most_steps * dt[:, None]).clamp(max=most_s)).any()):
-        return None
-    return EvenRows.build(dt, runs.u, runs.mask, accel=runs.accel, speed=runs.speed)
+    return None if bool((off > (most_steps * dt[:, None]).clamp(max=most_s)).any()) else dt
 
 
 class LatentDensity:
     """Posterior of ``T_L`` [s], ``K_L`` [-] and the noise of every window (latent form).
 
-    ``names`` is ``latent_names``; the density is in ``z = log(parameter)``. Even rows take the fast route, others the
-    row-by-row filter; both give the same number. Gaps and unused rows split a window into runs, whose likelihoods add.
+    ``names`` is ``latent_names``; the density is in ``z = log(parameter)``. Gaps and unused rows split a window into
+    runs, whose likelihoods add.
 
     ``temper`` in (0, 1] is a power on the likelihood, for logs whose windows still spread wider than their posteriors
     (a gain that differs between throttle and brake, say); SDs grow about as ``temper^-1/2``. 1 is the law as written.
@@ -133,7 +148,7 @@ class LatentDensity:
         own = Joint(default_actuation_prior(), default_noise_prior(self.names[2:])) if prior is None else prior
         self.prior = prior_on(own, data.time.device)
         self._runs, self._owner = data.runs()
-        self._even = even_rows(self._runs)
+        self._steps = even_steps(self._runs)
 
     @property
     def windows(self) -> int:
@@ -146,7 +161,7 @@ class LatentDensity:
     def log_likelihood(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
         """``z`` ``(..., window, parameter)``; returns ``(..., window)`` [nats], not tempered."""
         p = dict(zip(self.names, z[..., self._owner, :].exp().unbind(-1), strict=True))
-        per_run = run_log_likelihood(p, self._runs, self._even)
+        per_run = run_log_likelihood(p, self._runs, self._steps)
         if len(self._owner) == self.windows:
             return per_run
         return per_run.new_zeros(*per_run.shape[:-1], self.windows).index_add(-1, self._owner, per_run)
@@ -154,17 +169,24 @@ class LatentDensity:
     def approximation(self) -> LatentDensity:
         """The same law with rows moved to an even grid where none of them moves by a step, for `weighted_draws`: this
         density itself where its rows are even, or too uneven."""
-        if self._even is not None:
-            return self
-        even = even_rows(self._runs, most_steps=1.0, most_s=torch.inf)
-        if even is None:
+        steps = None if self._steps is not None else even_steps(self._runs, most_steps=1.0, most_s=torch.inf)
+        if steps is None:
             return self
         near = copy(self)
-        near._even = even
+        near._steps = steps
         return near
 
     def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
         return self.temper * self.log_likelihood(z) + self.prior.log_prob(z)
+
+    @torch.no_grad()
+    def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
+        """Gradient of :meth:`log_prob` by central differences `SPACING` apart: compiled values cost so little that all
+        of them take a fraction of the time of a graph, and they are good to 1e-5 of a posterior SD."""
+        d = z.shape[-1]
+        shifts = SPACING * torch.eye(d, dtype=z.dtype, device=z.device).reshape(d, *[1] * (z.dim() - 1), d)
+        ahead, behind = self.log_prob(z + torch.stack([shifts, -shifts]))
+        return (ahead - behind).movedim(0, -1) / (2 * SPACING)
 
     def initial(self) -> Float[Tensor, "window parameter"]:
         """The best of a coarse grid over lag, gain and process noise, the rest at the prior's centre."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
-from avtorch.inference.density import Density, ScoredDensity, has_score
+from avtorch.inference.density import Density, ScoredDensity, has_quick_values, has_score
 from avtorch.inference.exponential_form import ExponentialForm, has_form, outdated
 from avtorch.inference.newton import FLAT, as_tensors, ascend
 
@@ -69,7 +69,7 @@ def find_mode(
     start: Float[Tensor, "window parameter"] | None = None,
     iterations: int = 60,
     tolerance: float = 1e-8,
-    from_values: bool = False,
+    from_values: bool | None = None,
 ) -> Mode:
     """Damped Newton ascent of the log density, batched over windows.
 
@@ -81,7 +81,8 @@ def find_mode(
         tolerance: end when half the Newton decrement, the possible further decrease of the potential, is below this in
             every window. 1e-8 leaves the mode within 1.5e-4 posterior SDs.
         from_values: take gradient and curvature from differences of the log density, all points of them in one call, in
-            place of a graph: for a density whose values are many times cheaper than its derivatives.
+            place of a graph: for a density whose values are many times cheaper than its derivatives, which is also the
+            default for one that says so of itself (``quick_values``).
 
     Example:
         >>> from avtorch.inference import find_mode
@@ -91,6 +92,7 @@ def find_mode(
         >>> bool((density.score(mode.z).abs() < 1e-3).all())  # the slope vanishes there
         True
     """
+    from_values = has_quick_values(density) if from_values is None else from_values
     z = (density.initial() if start is None else start).detach().clone()
     form = None if from_values else _form(density, z)
     if form is not None:
@@ -147,7 +149,7 @@ def _expand(
     z = z.detach()
     if from_values:
         potential, gradient, hessian = _from_values(density, z)
-    elif has_score(density):
+    elif has_score(density) and not has_quick_values(density):
         potential, gradient, hessian = _from_score(density, z)
     else:
         potential, gradient, hessian = _from_graph(density, z)

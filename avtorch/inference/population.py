@@ -5,8 +5,8 @@ and from drive to drive; cars vary about their model's mean:
 
     y_drive ~ Normal(car, sd_drive² + within²),    car ~ Normal(mean, between²).
 
-`PopulationDensity` is the joint density of mean, spreads and cars, `PopulationMargin` the same with the cars integrated
-out, which stays small however many they are (Gelman et al., Bayesian Data Analysis, chapter 5).
+`PopulationMargin` is the density of mean and spreads with the cars integrated out: two or three parameters, however
+many cars there are (Gelman et al., Bayesian Data Analysis, chapter 5).
 """
 
 from __future__ import annotations
@@ -29,8 +29,32 @@ by nothing. It vanishes at 0, where a half-normal leaves a tail in the logarithm
 _LOG_2PI = math.log(2 * math.pi)
 
 
-class _Drives:
-    """What drives say of cars, and the parameters that both densities share."""
+class PopulationMargin:
+    """A model's mean and spreads from the drives of its cars, one posterior per quantity.
+
+    Parameters: `mean` of the logarithm over cars, `between`, the SD of cars about it, and `within`, the SD of a car's
+    drives about the car (only where some car has two drives or more). Priors: Normal(0, 2²) of the mean and
+    Gamma(2, 2 / `spread`) of the spreads. `cars_given` has the cars themselves.
+
+    Args:
+        values: `(quantity, drive)`, a drive's estimate of the logarithm.
+        sd: `(quantity, drive)`, its standard deviation.
+        car: `(drive,)`, the number of the drive's car, from 0.
+        spread: prior mean of the spreads.
+
+    Raises:
+        InputError: for other shapes, numbers that are not finite, an sd or spread of 0, fewer than two cars, or numbers
+            of cars with a gap.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import PopulationMargin, sample
+        >>> lag = torch.tensor([[0.30, 0.32, 0.31, 0.33, 0.60]]).log()
+        >>> margin = PopulationMargin(lag, torch.full_like(lag, 0.02), torch.arange(5))
+        >>> posterior = sample(margin, generator=torch.Generator().manual_seed(0))
+        >>> posterior.names, round(posterior["mean"].mean().exp().item(), 1)  # a typical car's lag
+        (('mean', 'between'), 0.4)
+    """
 
     def __init__(
         self,
@@ -62,8 +86,14 @@ class _Drives:
 
     @property
     def hyper(self) -> tuple[str, ...]:
-        """Names of the parameters beside the cars: mean, between, and within where drives repeat."""
+        """Names of the parameters, beside the cars that were integrated out: mean, between, and within where drives
+        repeat."""
         return ("mean", "between", "within") if self.repeated else ("mean", "between")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """As `hyper`."""
+        return self.hyper
 
     def of_cars(
         self, within: Float[Tensor, "*draw quantity"]
@@ -87,6 +117,26 @@ class _Drives:
         share = share / (1 + share)
         return share * mean + (1 - share) * z[..., :1], share / precision
 
+    def constrain(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
+        """Spreads in place of their logarithms; the mean is one of the quantity's logarithm already. Shape of `z`."""
+        return torch.cat([z[..., :1], z[..., 1:].exp()], -1)
+
+    def log_prob(self, z: Float[Tensor, "*draw quantity parameter"]) -> Float[Tensor, "*draw quantity"]:
+        """Log density of `z` `(..., quantity, parameter)`; returns `(..., quantity)`."""
+        between, within = self._spreads(z)
+        mean, precision, left = self.of_cars(within)
+        pooled = _log_normal(mean - z[..., :1], between.square()[..., None] + 1 / precision)
+        return self._log_prior(z) + (pooled + left).sum(-1)
+
+    def initial(self) -> Float[Tensor, "quantity parameter"]:
+        """`(quantity, parameter)`."""
+        spread = self.values.std(1).clamp_min(0.02).log()
+        return torch.stack([self.values.mean(1), spread, spread - 0.7][: len(self.hyper)], -1)
+
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " quantity"]) -> PopulationMargin:
+        """The quantities named by `index`."""
+        return PopulationMargin(self.values[index], self.sd[index], self.car, spread=self.spread)
+
     def _summed(self, x: Float[Tensor, "*draw quantity drive"]) -> Float[Tensor, "*draw quantity car"]:
         return x.new_zeros(*x.shape[:-1], self.cars).index_add(-1, self.car, x)
 
@@ -101,115 +151,6 @@ class _Drives:
             rate = 2 / self.spread
             found = found + 2 * math.log(rate) + 2 * z[..., i] - rate * z[..., i].exp()
         return found
-
-    def _start(self) -> Float[Tensor, "quantity hyper"]:
-        spread = self.values.std(1).clamp_min(0.02).log()
-        return torch.stack([self.values.mean(1), spread, spread - 0.7][: len(self.hyper)], -1)
-
-
-class PopulationDensity(_Drives):
-    """The joint density of the model's mean and spreads and of every car, one posterior per quantity.
-
-    Parameters: `mean` of the logarithm over cars, `between`, the SD of cars about it, `within`, the SD of a car's
-    drives about the car (only where some car has two drives or more), and `car_0`, `car_1`, ..., each the logarithm of
-    the car's quantity. Priors: Normal(0, 2²) of the mean and Gamma(2, 2 / `spread`) of the spreads.
-
-    Cars written as themselves have no joint mode: as `between` falls to 0 all cars meet at the mean, and the density
-    grows without bound. So `z` has the logarithms of the spreads, and of each car the number of standard deviations
-    from its mean, both given mean and spreads; the Jacobian is counted.
-
-    Args:
-        values: `(quantity, drive)`, a drive's estimate of the logarithm.
-        sd: `(quantity, drive)`, its standard deviation.
-        car: `(drive,)`, the number of the drive's car, from 0.
-        spread: prior mean of the spreads.
-
-    Raises:
-        InputError: for other shapes, numbers that are not finite, an sd or spread of 0, fewer than two cars, or numbers
-            of cars with a gap.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import PopulationDensity, sample
-        >>> lag = torch.tensor([[0.30, 0.32, 0.31, 0.33, 0.60]]).log()  # one quantity, five cars
-        >>> density = PopulationDensity(lag, torch.full_like(lag, 0.2), torch.arange(5))
-        >>> posterior = sample(density, generator=torch.Generator().manual_seed(0))
-        >>> posterior.converged.item(), posterior["car_4"].mean().exp().item() < 0.5  # drawn to its siblings
-        (True, True)
-    """
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Hyperparameters, then the cars."""
-        return self.hyper + tuple(f"car_{i}" for i in range(self.cars))
-
-    def constrain(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
-        """Mean, spreads and cars, shape of `z` `(..., quantity, parameter)`."""
-        mean, variance = self.cars_given(z)
-        cars = mean + variance.sqrt() * z[..., len(self.hyper) :]
-        return torch.cat([z[..., :1], z[..., 1 : len(self.hyper)].exp(), cars], -1)
-
-    def log_prob(self, z: Float[Tensor, "*draw quantity parameter"]) -> Float[Tensor, "*draw quantity"]:
-        """Log density of `z` `(..., quantity, parameter)`; returns `(..., quantity)`."""
-        between, within = self._spreads(z)
-        mean, conditional = self.cars_given(z)
-        cars = mean + conditional.sqrt() * z[..., len(self.hyper) :]
-        variance = self.sd**2 + within.square()[..., None]
-        drives = _log_normal(self.values - cars[..., self.car], variance).sum(-1)
-        pooled = _log_normal(cars - z[..., :1], between.square()[..., None]).sum(-1)
-        return self._log_prior(z) + drives + pooled + 0.5 * conditional.log().sum(-1)
-
-    def initial(self) -> Float[Tensor, "quantity parameter"]:
-        """`(quantity, parameter)`."""
-        return torch.cat([self._start(), self.values.new_zeros(self.windows, self.cars)], -1)
-
-    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " quantity"]) -> PopulationDensity:
-        """The quantities named by `index`."""
-        return PopulationDensity(self.values[index], self.sd[index], self.car, spread=self.spread)
-
-
-class PopulationMargin(_Drives):
-    """`PopulationDensity` with the cars integrated out: two or three parameters for any number of cars.
-
-    Args:
-        values, sd, car, spread: as of `PopulationDensity`.
-
-    Raises:
-        InputError: as `PopulationDensity`.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import PopulationMargin, sample
-        >>> lag = torch.tensor([[0.30, 0.32, 0.31, 0.33, 0.60]]).log()
-        >>> margin = PopulationMargin(lag, torch.full_like(lag, 0.02), torch.arange(5))
-        >>> posterior = sample(margin, generator=torch.Generator().manual_seed(0))
-        >>> posterior.names, round(posterior["mean"].mean().exp().item(), 1)  # a typical car's lag
-        (('mean', 'between'), 0.4)
-    """
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The hyperparameters."""
-        return self.hyper
-
-    def constrain(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
-        """Spreads in place of their logarithms; the mean is one of the quantity's logarithm already. Shape of `z`."""
-        return torch.cat([z[..., :1], z[..., 1:].exp()], -1)
-
-    def log_prob(self, z: Float[Tensor, "*draw quantity parameter"]) -> Float[Tensor, "*draw quantity"]:
-        """Log density of `z` `(..., quantity, parameter)`; returns `(..., quantity)`."""
-        between, within = self._spreads(z)
-        mean, precision, left = self.of_cars(within)
-        pooled = _log_normal(mean - z[..., :1], between.square()[..., None] + 1 / precision)
-        return self._log_prior(z) + (pooled + left).sum(-1)
-
-    def initial(self) -> Float[Tensor, "quantity parameter"]:
-        """`(quantity, parameter)`."""
-        return self._start()
-
-    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " quantity"]) -> PopulationMargin:
-        """The quantities named by `index`."""
-        return PopulationMargin(self.values[index], self.sd[index], self.car, spread=self.spread)
 
 
 def _log_normal(off: Tensor, variance: Tensor | float) -> Tensor:

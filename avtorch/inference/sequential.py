@@ -27,7 +27,7 @@ from avtorch.inference.priors import (
 )
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings
-from avtorch.inference.state import about, generator_of, shaped_as
+from avtorch.inference.state import about, shaped_as
 
 Mode = Literal["lambda", "posterior", "forgetting"]
 
@@ -164,25 +164,19 @@ class SequentialInference:
         """Continue from :meth:`state_dict`.
 
         Raises:
-            InputError: if it was saved by a loop of another mode or other parameters, or has other shapes, types or
-                numbers than a loop saves; nothing is then changed.
+            InputError: if it was saved by a loop of another mode or other parameters, or has other shapes or types than
+                this one saves; nothing is then changed.
         """
         saved = about(state, "mode")
         own = about(self.state_dict(), "mode")
         if saved != own:
             raise InputError(f"state: (mode, names, vehicles) were {saved} when it was saved, here they are {own}")
         shaped_as(self.state_dict(), state, "state")
-        belief, generator = (
-            self.belief.taken_from(state),
-            generator_of(state["generator"], "state.generator", self.device),
-        )
-        if bool((state["cov_z"].diagonal(dim1=-2, dim2=-1) < 0).any()):
-            raise InputError("state: cov_z: holds a variance below 0")
-        self.belief = belief
+        self.belief = self.belief.taken_from(state)
         self._started, self._mean_z, self._cov_z = (
             state[key].clone().to(self.device) for key in ("started", "mean_z", "cov_z")
         )
-        self.generator.set_state(generator.get_state())
+        self.generator.set_state(state["generator"])
 
 
 def _thin(draws: Tensor, count: int) -> Tensor:

@@ -8,9 +8,11 @@ from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
 
+from avtorch.arrays import Float
 from avtorch.errors import InputError
-from avtorch.inference.langevin import LangevinOptimizer
 
 Noise = Literal["independent", "averaged"]
 
@@ -18,7 +20,7 @@ Noise = Literal["independent", "averaged"]
 _add_to_each = torch._foreach_add_  # pyright: ignore[reportPrivateImportUsage, reportPrivateUsage]
 
 
-class SGLD(LangevinOptimizer):
+class SGLD(Optimizer):
     r"""Samples from :math:`\exp(-U)` by noisy gradient steps.
 
     .. math::
@@ -96,10 +98,50 @@ class SGLD(LangevinOptimizer):
             "maximize": maximize,
             "foreach": foreach,
         }
-        super().__init__(params, defaults, generator)
+        self.check(defaults)
+        self.generator = generator
+        super().__init__(params, defaults)
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        self.check({**self.defaults, **param_group})
+        super().add_param_group(param_group)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "generator": self.generator}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        for group in self.param_groups:
+            for key, value in self.defaults.items():
+                group.setdefault(key, value)
+
+    def state_dict(self) -> dict[str, Any]:
+        """As in ``torch.optim``, with the generator's state beside it."""
+        state = super().state_dict()
+        if self.generator is not None:
+            state["generator"] = self.generator.get_state()
+        return state
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        state = dict(state_dict)
+        generator = state.pop("generator", None)
+        super().load_state_dict(state)
+        if generator is not None:
+            if self.generator is None:
+                self.generator = torch.Generator(device=self.param_groups[0]["params"][0].device)
+            self.generator.set_state(generator)
+
+    def normal_like(self, p: Float[Tensor, "*parameter"], dtype: torch.dtype | None) -> Float[Tensor, "*parameter"]:
+        """Standard normal noise in the shape of ``p`` and, for arithmetic in one sweep, in its order in memory."""
+        order = sorted(range(p.dim()), key=p.stride, reverse=True)
+        shape = [p.shape[i] for i in order]
+        drawn = torch.randn(shape, dtype=dtype or p.dtype, device=p.device, generator=self.generator)
+        return drawn.permute([order.index(i) for i in range(p.dim())])
 
     @staticmethod
     def check(options: dict[str, Any]) -> None:
+        """Refuse a bad option by its name; raises InputError."""
+
         def positive(name: str, low: float, high: float, *, closed: bool = False) -> None:
             value = float(options[name])
             if not ((low <= value if closed else low < value) and value < high):
@@ -234,3 +276,25 @@ def _hessian_diagonal(p: Tensor, gradient: Tensor, chain_dims: int) -> Tensor:
         row = torch.zeros_like(p) if derivative is None else derivative
         columns.append((row.flatten(chain_dims) if p.dim() > chain_dims else row.unsqueeze(-1))[..., i])
     return torch.stack(columns, -1).reshape(p.shape)
+
+
+def harmonic(optimizer: Optimizer) -> LambdaLR:
+    """The paper's ``eta_k = eta_1 / k`` (Algorithm 1), ``k = 1, 2, ...``; ``eta_1`` is the optimizer's ``lr``.
+
+    The sum of its steps grows only like ``log k``: the chain freezes long before it has explored the posterior. It is
+    provided for comparison.
+    """
+    return LambdaLR(optimizer, lambda k: 1.0 / (k + 1))
+
+
+def polynomial(optimizer: Optimizer, *, b: float = 100.0, gamma: float = 1 / 3) -> LambdaLR:
+    """Welling and Teh's ``eta_k = a (b + k)^-gamma``, as ``lr (1 + k/b)^-gamma``: it starts at ``lr = a b^-gamma``.
+
+    Raises:
+        InputError: for ``b <= 0`` or ``gamma`` outside ``(0, 1]``.
+    """
+    if not b > 0:
+        raise InputError(f"b: {b} is not positive")
+    if not 0 < gamma <= 1:
+        raise InputError(f"gamma: {gamma} is not in (0, 1]")
+    return LambdaLR(optimizer, lambda k: (1 + k / b) ** -gamma)

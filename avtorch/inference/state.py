@@ -1,15 +1,16 @@
-"""Saved states checked against the streams that load them: accepted as a whole, or not at all."""
+"""Saved states against those who load them: of the same parameters, vehicles and draws, or refused as a whole.
+
+What was damaged on its way is found by the checksum of the stream that it belongs to.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference.device import generator_on
 
 
 def shaped_as(own: Any, given: Any, place: str) -> None:
@@ -19,34 +20,24 @@ def shaped_as(own: Any, given: Any, place: str) -> None:
         InputError: that names the `place` within the state.
     """
     if isinstance(own, Tensor):
-        tensor_as(given, own.dtype, tuple(own.shape), place)
+        if not isinstance(given, Tensor) or given.dtype != own.dtype or given.shape != own.shape:
+            found = f"{given.dtype} of shape {tuple(given.shape)}" if isinstance(given, Tensor) else _kind(given)
+            raise InputError(f"{place}: found {found}, needs {own.dtype} of shape {tuple(own.shape)}")
+        if own.dtype.is_floating_point and not bool(given.isfinite().all()):
+            raise InputError(f"{place}: holds numbers that are not finite")
+    elif type(given) is not type(own):
+        raise InputError(f"{place}: found {_kind(given)}, needs {_kind(own)}")
     elif isinstance(own, Mapping):
-        if not isinstance(given, dict) or set(given) != set(own):
-            found = f"found {_keys(given)}" if isinstance(given, dict) else f"found a {type(given).__name__}"
-            raise InputError(f"{place}: {found}, needs {_keys(own)}")
+        if set(given) != set(own):
+            found, needed = (", ".join(sorted(map(str, x)))[:200] or "nothing" for x in (given, own))
+            raise InputError(f"{place}: found {found}, needs {needed}")
         for key, value in own.items():
             shaped_as(value, given[key], f"{place}.{key}")
     elif isinstance(own, (list, tuple)):
-        if type(given) is not type(own) or len(given) != len(own):
-            raise InputError(f"{place}: found {_words(given)}, needs {len(own)} entries")
+        if len(given) != len(own):
+            raise InputError(f"{place}: found {len(given)} entries, needs {len(own)}")
         for i, value in enumerate(own):
             shaped_as(value, given[i], f"{place}[{i}]")
-    elif type(given) is not type(own):
-        raise InputError(f"{place}: found a {type(given).__name__}, needs a {type(own).__name__}")
-
-
-def tensor_as(given: Any, dtype: torch.dtype, shape: tuple[int, ...], place: str, *, finite: bool = True) -> None:
-    """Check a tensor's dtype and shape against these; its numbers must be finite unless `finite` is False.
-
-    Raises:
-        InputError: that names the `place` within the state.
-    """
-    if type(given) is not Tensor or given.layout is not torch.strided or given.device.type != "cpu":
-        raise InputError(f"{place}: found a {type(given).__name__}, needs a plain tensor")
-    if given.dtype != dtype or tuple(given.shape) != shape:
-        raise InputError(f"{place}: found {given.dtype} of shape {tuple(given.shape)}, needs {dtype} of {shape}")
-    if finite and dtype.is_floating_point and not bool(given.isfinite().all()):
-        raise InputError(f"{place}: holds numbers that are not finite")
 
 
 def about(state: Any, *more: str) -> tuple[Any, ...]:
@@ -58,23 +49,5 @@ def about(state: Any, *more: str) -> tuple[Any, ...]:
     return *(given.get(key) for key in more), plain, len(mean) if isinstance(mean, Tensor) and mean.ndim else None
 
 
-def generator_of(state: Tensor, place: str, device: torch.device) -> torch.Generator:
-    """A generator of the device in this state.
-
-    Raises:
-        InputError: where it is no generator's state.
-    """
-    made = generator_on(device, 0)
-    try:
-        made.set_state(state)
-    except (RuntimeError, TypeError) as fault:
-        raise InputError(f"{place}: is no state of a generator ({str(fault).splitlines()[0]})") from None
-    return made
-
-
-def _keys(x: Mapping[Any, Any]) -> str:
-    return ", ".join(sorted(str(key)[:40] for key in x)[:20]) or "nothing"
-
-
-def _words(x: Any) -> str:
-    return f"{len(x)} entries" if isinstance(x, (list, tuple)) else f"a {type(x).__name__}"
+def _kind(x: Any) -> str:
+    return f"a {type(x).__name__}"

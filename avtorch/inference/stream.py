@@ -19,7 +19,7 @@ from avtorch.inference.belief import Belief
 from avtorch.inference.device import Device, checked_device
 from avtorch.inference.estimators.choose import make_estimator
 from avtorch.inference.form import Form, JerkForm
-from avtorch.inference.stream_state import check_clock, read_state, with_checksum, without_checksum, write_state
+from avtorch.inference.stream_state import read_state, with_checksum, without_checksum, write_state
 from avtorch.inference.stream_units import StreamUnits
 from avtorch.io.clock import ROUNDING_S, decimals
 from avtorch.io.engagement import settled_rows
@@ -339,7 +339,7 @@ class BeliefStream:
 
         Raises:
             InputError: if it was saved by a stream of another window length, form, estimator or number of vehicles, or
-                was changed since: by its checksum, shapes, types, numbers that are not finite, times out of order.
+                was changed since, by its checksum.
         """
         state = without_checksum(state)
         own = {"estimator": self.estimator, "form": type(self.form).__name__, "window": self.window}
@@ -349,7 +349,6 @@ class BeliefStream:
                 raise InputError(f"state: saved {setting} {str(state.get(name))[:40]!r}, not {value!r}")
         if set(state) != {"rows", "epoch", "origin", "index", "last", "driven", "inference", "vehicles", "units", *own}:
             raise InputError(f"state: holds {', '.join(sorted(map(str, state)))[:200]}, not what a stream saves")
-        check_clock(state, columns=self._rows, vehicles=self.vehicles)
         stretch = StreamUnits(self.form.columns, self.vehicles)
         if state["units"] is not None:
             stretch.load_state_dict(state["units"])

@@ -19,12 +19,11 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.inference.form import Rows
 from avtorch.inference.jerk import JerkStatistics
-from avtorch.inference.state import tensor_as
 from avtorch.io.consistency import LATER_S, MIN_SPANS, SPANS_S, may_be_late
 from avtorch.io.units import GRAVITY
 from avtorch.io.validity import ACCEL_FACTORS, SAME_MOTION, SPEED_FACTORS
 
-RATES = (("position", "speed"), ("speed", "accel"), ("accel", "jerk"))
+RATES = (("speed", "accel"), ("accel", "jerk"))
 """Pairs of a level and its rate, among the columns of the forms."""
 COMMAND = (0.02, 3.5)
 """Range of plausible gains; the limit for a log is lower, but ten seconds of a real race car gave 3.2."""
@@ -44,7 +43,6 @@ _HINTS = {
     ("speed", "accel"): {f"speed is in {k}": v for k, v in SPEED_FACTORS.items()}
     | {f"accel is in {k}": v for k, v in ACCEL_FACTORS.items()},
     ("accel", "jerk"): {"accel is in g": 1 / GRAVITY, "accel is in cm/s2": 100.0, "jerk is in g/s": GRAVITY},
-    ("position", "speed"): {"speed is in km/h": 1 / 3.6, "position is in km": 0.001},
     ("speed", "accel_cmd"): {"accel_cmd is in g": GRAVITY, "accel_cmd is in cm/s2": 0.01, "speed is in km/h": 3.6},
     ("accel", "accel_cmd"): {"accel_cmd is in g": GRAVITY, "accel_cmd is in cm/s2": 0.01, "accel is in cm/s2": 100.0},
 }
@@ -224,26 +222,12 @@ class StreamUnits:
         """Go on from :meth:`state_dict`.
 
         Raises:
-            InputError: for other columns, shapes, types or numbers than a stretch has.
+            InputError: for what is no stretch's state.
         """
         if not isinstance(state, dict) or set(state) != {"rows", "sums", "looks", "before"}:
             raise InputError("state: units: not what a stream saves")
-        rows, sums, checks, before = (state[key] for key in ("rows", "sums", "looks", "before"))
-        names = {"time", "usable", "lost", *self.columns, *(f"total {name}" for name in self.columns)}
-        if not isinstance(rows, dict) or (rows and set(rows) != names) or bool(rows) != (before is not None):
-            raise InputError(f"state: units: needs the rows {', '.join(sorted(names))}, or none")
-        if type(checks) is not int or not 0 <= checks < len(CHECKS_S):
-            raise InputError(f"state: units: looks: found {str(checks)[:40]}, needs a whole number from 0")
-        time = rows.get("time")
-        if rows and (type(time) is not Tensor or time.ndim != 1 or not len(time)):
-            raise InputError("state: units: rows.time: needs a tensor of shape (time,)")
-        for name, value in rows.items():
-            shape = (len(rows["time"]),) if name == "time" else (self.vehicles, len(rows["time"]))
-            tensor_as(value, torch.float64, shape, f"state: units: rows.{name}")
-        if sums is not None:
-            tensor_as(sums, torch.float64, (7, self.vehicles), "state: units: sums")
-        self.rows = {name: value.numpy().copy() for name, value in rows.items()}
-        self.sums, self.checks, self.before = sums, checks, before
+        self.rows = {name: value.numpy().copy() for name, value in state["rows"].items()}
+        self.sums, self.checks, self.before = (state[key] for key in ("sums", "looks", "before"))
 
 
 def _change(time: FloatArray, x: FloatArray, begin: FloatArray, end: FloatArray) -> FloatArray:

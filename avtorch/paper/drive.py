@@ -1,5 +1,5 @@
 """The paper's drive: a vehicle that changes at 26 s and gets a new setting at 28 s, for many settings and seeds in one
-batch."""
+batch. And its protocol of estimation: windows of 5 s at 100 Hz, three to form a prior, seven more (Section 3.3)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ import torch
 from torch import Tensor
 
 from avtorch.decision.settings import Setting
+from avtorch.inference import BeliefStream
+from avtorch.inference.stream import Window
+from avtorch.io.log import STANDSTILL_MPS
+from avtorch.paper.leaders import SWEEP_S
 from avtorch.vehicle import ClosedLoop, GLVDPlant, Leader
 from avtorch.vehicle.block import Block
 
@@ -23,6 +27,9 @@ CHANGE_S, ACT_S = 26.0, 28.0
 
 NOISE = 0.1
 """Jerk noise [m/s³]; the paper gives none (SPEC section 1)."""
+
+WINDOW_S = 5.0
+FOR_PRIOR, MORE = 3, 7
 
 Progress = Callable[[float], None]
 """Called with the share of an experiment that is done, 0 to 1."""
@@ -73,6 +80,29 @@ def drive(
     whole = Block.concatenate(blocks)
     rows = {name: x.unflatten(0, (count, seeds)) for name, x in vars(whole).items() if name != "time"}
     return Block(whole.time, **rows)
+
+
+def ten_windows(
+    leader: Leader, T_L: Tensor, K_L: Tensor, *, seed: int, progress: Progress
+) -> tuple[list[Window], list[Tensor]]:
+    """Vehicles T_L [s], K_L [-] (run,) behind `leader`, each with its own noise and its own belief.
+
+    The nominal controller drives, its demand passed through. Returns the ten windows and, of each, the RMS of the
+    command (run,) [m/s²].
+    """
+    runs = len(T_L)
+    loop = ClosedLoop(leader, plant=GLVDPlant(T_L, K_L, sigma=NOISE), scenarios=runs, seeds=noise_seeds(seed, runs))
+    stream = BeliefStream(window=WINDOW_S, vehicles=runs, seed=seed, check_units=False)
+    windows: list[Window] = []
+    asked: list[Tensor] = []
+    while loop.time < SWEEP_S - 1e-9:
+        block = loop.advance(round(WINDOW_S / loop.dt))
+        columns = {name: getattr(block, name) for name in stream.form.columns}
+        moving = block.speed >= STANDSTILL_MPS
+        windows += stream.feed(block.time, columns, usable=moving, until=loop.time)
+        asked.append(block.accel_cmd.square().mean(-1).sqrt())
+        progress(loop.time / SWEEP_S)
+    return windows, asked
 
 
 def stacked(settings: list[Setting]) -> Setting:

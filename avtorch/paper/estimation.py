@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.paper.drive import Progress
+from avtorch.paper.drive import FOR_PRIOR, MORE, Progress, ten_windows
 from avtorch.paper.leaders import Ahead, Leaders
 from avtorch.paper.rows import ClaimRow, bootstrap_runs, middle, number_list, share, sign, spread, within
-from avtorch.paper.windows import FOR_PRIOR, MORE, ten_windows
 
 LAGS = (0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 1.6, 2.0)
 """T_L [s], with K_L = 1."""

@@ -18,10 +18,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.paper.drive import Progress
+from avtorch.paper.drive import Progress, ten_windows
 from avtorch.paper.leaders import Ahead, Leaders
 from avtorch.paper.rows import MOST, ClaimRow, middle, sign, spread
-from avtorch.paper.windows import ten_windows
 from avtorch.vehicle.stability import (
     local_conditions,
     local_stable,

@@ -20,7 +20,7 @@ def calibration_figure(calibration: RankCalibration, *, title: str = "") -> Figu
     Example:
         >>> import torch
         >>> from avtorch.plots import calibration_figure
-        >>> from avtorch.validation.ranks import RankCalibration
+        >>> from avtorch.validation.calibration import RankCalibration
         >>> g, names = torch.Generator().manual_seed(0), ("T_L", "K_L")
         >>> ranks, below = torch.randint(0, 100, (200, 2), generator=g), torch.rand(200, 2, generator=g)
         >>> figure = calibration_figure(RankCalibration(names, ranks, 99, below.double(), dropped=0))

@@ -8,10 +8,10 @@ Example:
     [True, True]
 """
 
-from avtorch.validation.agreement import Agreement, agreement, between
-from avtorch.validation.agreement_verdict import AgreementVerdict
+from avtorch.validation.agreement import Agreement, AgreementVerdict, agreement, between
+from avtorch.validation.reference import NutsSettings
 from avtorch.validation.stein import Stein, stein_discrepancy
-from avtorch.validation.validate import NutsSettings, Validation, validate
+from avtorch.validation.validate import Validation, validate
 from avtorch.validation.windows import Windows, synthetic_windows, windows_from_prior, windows_of_log
 
 __all__ = [

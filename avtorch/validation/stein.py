@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference.density import Density, ScoredDensity
+from avtorch.inference.coordinates import score_of
+from avtorch.inference.density import Density
 from avtorch.inference.map import Mode, find_mode
 
 #: Numbers of a kernel matrix at once, over windows.
@@ -101,7 +102,7 @@ def stein_discrepancy(
     flat = thin.flatten(0, 1)
     count, windows, _ = flat.shape
     # gradient in w of z = mode + scale w
-    score = torch.einsum("wji,nwj->nwi", mode.scale, _score(density, flat))
+    score = torch.einsum("wji,nwj->nwi", mode.scale, score_of(density, flat))
     w = torch.einsum("wij,nwj->nwi", torch.linalg.inv(mode.scale), flat - mode.z)
     value, expected, p_value = [], [], []
     step = max(1, BLOCK // count**2)
@@ -131,14 +132,6 @@ def _signs(shape: torch.Size, count: int, flip: float, generator: torch.Generato
     turns = torch.rand(count, chains, draws - 1, generator=generator) < flip
     odd = torch.cat([start, turns], -1).cumsum(-1) % 2
     return (1 - 2 * odd).flatten(1)
-
-
-def _score(density: Density, z: Tensor) -> Tensor:
-    if isinstance(density, ScoredDensity):
-        return density.score(z)
-    z = z.detach().requires_grad_()
-    (gradient,) = torch.autograd.grad(density.log_prob(z).sum(), z)
-    return gradient
 
 
 def _stein_kernel(x: Tensor, score: Tensor, scale: float) -> Tensor:

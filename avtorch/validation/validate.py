@@ -23,18 +23,19 @@ from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.inference.units import shown_unit
 from avtorch.io.source import LogSource, as_log
-from avtorch.validation.agreement import Agreement, agreement, between
-from avtorch.validation.agreement_verdict import AgreementVerdict, agreement_verdict
-from avtorch.validation.exact import exact_draws
-from avtorch.validation.nuts_reference import (
+from avtorch.validation.agreement import Agreement, AgreementVerdict, agreement, agreement_verdict, between
+from avtorch.validation.reference import (
     LATENT_NUTS,
     LATENT_NUTS_WINDOWS,
     NUTS_WINDOWS,
     NutsSettings,
+    exact_draws,
+    join,
     join_draws,
+    reference,
+    select,
     walk_nuts,
 )
-from avtorch.validation.reference import join, reference, select
 from avtorch.validation.stein import Stein, stein_discrepancy
 from avtorch.validation.windows import Windows, windows_of_log
 

@@ -11,12 +11,11 @@ import torch
 from torch import Tensor
 
 from avtorch.inference import SGLD, SamplerSettings
-from avtorch.inference.control_variates import ControlVariates
 from avtorch.inference.coordinates import Coordinates, Whitening, stiffness
 from avtorch.inference.map import Mode
 from avtorch.inference.sampler import walk
-from avtorch.inference.schedules import harmonic, polynomial
-from avtorch.inference.sghmc import SGHMC
+from avtorch.inference.sgld import harmonic, polynomial
+from benchmarks.bias.control_variates import ControlVariates
 from benchmarks.bias.law import sd_ratio
 from benchmarks.bias.windows import Problem
 
@@ -29,7 +28,7 @@ SCHEDULES = {"eta_1/k": harmonic, "(1+k/100)^-1/3": polynomial}
 class Arm:
     """One row. Chains start at the posterior's mode unless ``start`` is ``"prior"``, the prior's centre.
 
-    ``friction`` makes it SGHMC; ``whitening="rmsprop"`` is pSGLD with Gamma and floor ``eps`` on isotropic coordinates,
+    ``whitening="rmsprop"`` is pSGLD with Gamma and floor ``eps`` on isotropic coordinates,
     started around the mode: at the mode itself the first gradient is zero, and so would be the scale derived from it.
     """
 
@@ -39,7 +38,6 @@ class Arm:
     whitening: Preconditioner = "full"
     cv: bool = False
     noise: Literal["independent", "averaged"] = "averaged"
-    friction: float | None = None
     eps: float = 0.1
     schedule: str = "constant"
     start: Literal["mode", "prior"] = "mode"
@@ -50,7 +48,7 @@ class Arm:
             return f"{self.schedule}, from {self.start}"
         if self.whitening == "rmsprop":
             return f"{self.noise}, eps {self.eps:g}"
-        return self.noise if self.friction is None else f"friction {self.friction:g}"
+        return self.noise
 
 
 def every_arm() -> list[Arm]:
@@ -65,9 +63,6 @@ def every_arm() -> list[Arm]:
         rows += [base, replace(base, step=1.0)]
         rows += [replace(base, batch=100, cv=cv) for cv in (False, True)]
     rows.append(Arm(other, 0.3, whitening="rmsprop", noise="independent", eps=1e-5))
-    momentum = "SGHMC, whitened"
-    rows += [Arm(momentum, h, friction=f) for h, f in product((0.3, 1.0, 2.0), (0.5, 1.0, 2.0))]
-    rows += [Arm(momentum, 0.3, b, cv=cv, friction=1.0) for b, cv in product((100, 10), (False, True))]
     base = Arm(LONG, 1.0, noise="independent")
     rows += [replace(base, start=s) for s in ("mode", "prior")]
     harmonic_rows = product((0.3, 1.0, 3.0), ("mode", "prior"))
@@ -103,12 +98,6 @@ def settings(arm: Arm, size: Length) -> SamplerSettings:
         def optimizer(params: list[Tensor], lr: float, generator: torch.Generator | None) -> SGLD:
             options = {"preconditioner": "rmsprop", "eps": arm.eps, "chain_dims": 2}
             return SGLD(params, lr, generator=generator, **options)
-
-    if arm.friction is not None:
-        friction = arm.friction
-
-        def optimizer(params: list[Tensor], lr: float, generator: torch.Generator | None) -> SGHMC:
-            return SGHMC(params, lr, friction=friction, generator=generator)
 
     return SamplerSettings(
         chains=size.chains,
@@ -150,8 +139,4 @@ def predict(arm: Arm, problem: Problem, covariances: dict[bool, Tensor]) -> Tens
     coordinates = coordinates.slowed(stiffness(problem.density, coordinates))
     covariance = None if arm.batch is None else covariances[arm.cv] / arm.batch
     averaged = arm.noise == "averaged"
-    if arm.friction is not None:
-        # momentum accumulates the noise of (1 + c)/(1 - c) steps
-        c = torch.exp(torch.tensor(-arm.friction * arm.step**0.5, dtype=torch.float64))
-        covariance = None if covariance is None else covariance * (1 + c) / (1 - c)
     return sd_ratio(problem, coordinates, arm.step, covariance, averaged=averaged, grows=arm.cv)

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from avtorch.inference import JerkDensity, find_mode
-from avtorch.inference.control_variates import gradients_by_point
 from benchmarks.bias.arms import Arm, Length, run
+from benchmarks.bias.control_variates import gradients_by_point
 from benchmarks.bias.measure import autocorrelation_time, effective, furthest
 from benchmarks.bias.windows import AMPLITUDES, Problem
 
@@ -108,7 +108,6 @@ def equal_compute(problem: Problem, printer: _Printer, *, quick: bool) -> None:
     arms = {
         "SGLD averaged, h 2": Arm("", 2.0),
         "SGLD independent, h 0.3": Arm("", 0.3, noise="independent"),
-        "SGHMC, h 2, friction 1": Arm("", 2.0, friction=1.0),
         f"SGLD averaged, h 0.3, batch {BATCH}": Arm("", 0.3, BATCH),
         f"SGLD averaged, h 0.3, batch {BATCH}, CV": Arm("", 0.3, BATCH, cv=True),
     }

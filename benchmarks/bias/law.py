@@ -13,8 +13,8 @@ import math
 import torch
 from torch import Tensor
 
-from avtorch.inference.control_variates import gradients_by_point
 from avtorch.inference.coordinates import Coordinates
+from benchmarks.bias.control_variates import gradients_by_point
 from benchmarks.bias.windows import Problem
 
 #: Laplace draws over which the noise that control variates leave is averaged.

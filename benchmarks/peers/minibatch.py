@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from avtorch.inference import JerkDensity, JerkStatistics, Mode, SamplerSettings, find_mode, integrate, sample
-from avtorch.inference.control_variates import ControlVariates
 from avtorch.inference.density import SubsampledDensity
+from benchmarks.bias.control_variates import ControlVariates
 from benchmarks.peers.pointwise import PointwiseDensity
 from benchmarks.peers.problem import make_windows
 from benchmarks.peers.score import WANTED

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from avtorch.inference import JerkDensity, PositionLagDensity, SpeedLagDensity
-from avtorch.inference.density import Density
+from avtorch.inference import JerkDensity
 from avtorch.inference.exponential_form import ExponentialForm, PotentialTerms
 from avtorch.inference.priors import (
     Joint,
@@ -68,8 +67,7 @@ def priors(windows: int):
 
 def densities(make_windows):
     statistics = make_windows(0, [0.3, 1.0, 2.0]).statistics
-    found: dict[str, Density] = {name: JerkDensity(statistics, prior) for name, prior in priors(3).items()}
-    return {**found, "speed": SpeedLagDensity(statistics), "position": PositionLagDensity(statistics)}
+    return {name: JerkDensity(statistics, prior) for name, prior in priors(3).items()}
 
 
-KINDS = ["first", "carried", "of the paper", "some started", "speed", "position"]
+KINDS = ["first", "carried", "of the paper", "some started"]

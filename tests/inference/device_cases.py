@@ -13,10 +13,7 @@ from avtorch.inference import (
     JerkDensity,
     JerkPoints,
     JerkStatistics,
-    PopulationDensity,
     PopulationMargin,
-    PositionLagDensity,
-    SpeedLagDensity,
     TorchDensity,
 )
 from avtorch.inference.latent import LatentDensity
@@ -74,24 +71,6 @@ def latent_density(device: Any, jitter: float = 0.0) -> LatentDensity:
     return LatentDensity(data.to(device))
 
 
-def speed_lag(device: Any) -> SpeedLagDensity:
-    _, c = rows()
-    parts = (c[name].to(device) for name in ("accel", "accel_cmd", "jerk"))
-    return SpeedLagDensity(SpeedLagDensity.sums(*parts))
-
-
-def position_lag(device: Any) -> PositionLagDensity:
-    g = torch.Generator().manual_seed(0)
-    error, v, noise = torch.randn(3, 2, 500, dtype=F64, generator=g)
-    accel = error / 0.25 - 2 * 0.7 / 0.5 * v + 0.1 * noise
-    return PositionLagDensity(PositionLagDensity.sums(*(x.to(device) for x in (error, v, accel))))
-
-
-def population(device: Any) -> PopulationDensity:
-    lag = torch.tensor([[0.30, 0.32, 0.31, 0.33, 0.60]], dtype=F64).log()
-    return PopulationDensity(*(x.to(device) for x in (lag, torch.full_like(lag, 0.2), torch.arange(5))))
-
-
 def margin(device: Any) -> PopulationMargin:
     lag = torch.tensor([[0.30, 0.32, 0.31, 0.33, 0.60]], dtype=F64).log()
     return PopulationMargin(*(x.to(device) for x in (lag, torch.full_like(lag, 0.02), torch.arange(5))))
@@ -111,9 +90,6 @@ DENSITIES: dict[str, Callable[[Any], Any]] = {
     "points": jerk_points,
     "even rows": latent_density,
     "uneven rows": lambda d: latent_density(d, 0.008),
-    "speed lag": speed_lag,
-    "position lag": position_lag,
-    "population": population,
     "margin": margin,
     "own": own,
 }

@@ -16,7 +16,7 @@ from avtorch.inference.exponential_form import ExponentialForm
 from avtorch.inference.kernel_loading import Unavailable, load_kernels
 from avtorch.inference.priors import HalfNormalPrior, Joint, default_actuation_prior
 from avtorch.inference.sampler import walk
-from avtorch.inference.schedules import polynomial
+from avtorch.inference.sgld import polynomial
 from tests.inference.compiled_cases import Gaussian, densities, generator
 
 pytest.importorskip("avtorch.inference.kernels", exc_type=ImportError)

@@ -9,7 +9,6 @@ import torch
 
 from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, JerkStatistics
-from avtorch.inference.conjugate import sample_conjugate
 from avtorch.inference.priors import (
     Joint,
     LogNormalPrior,
@@ -19,6 +18,7 @@ from avtorch.inference.priors import (
     default_jerk_noise_prior,
 )
 from avtorch.inference.quadrature import integrate
+from benchmarks.peers.conjugate import sample_conjugate
 from tests.bars import BAR
 
 F64 = torch.float64

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, JerkPoints, SamplerSettings, SubsampledDensity, find_mode, sample
-from avtorch.inference.control_variates import ControlVariates
 from avtorch.inference.sampler import walk
+from benchmarks.bias.control_variates import ControlVariates
 from tests.bars import BAR
 
 F64 = torch.float64

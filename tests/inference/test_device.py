@@ -22,16 +22,15 @@ from avtorch.inference import (
     find_mode,
     integrate,
     sample,
-    sample_conjugate,
 )
-from avtorch.inference.control_variates import ControlVariates
 from avtorch.inference.device import checked_device
 from avtorch.inference.estimators import ESTIMATORS
 from avtorch.inference.importance import weighted_draws
 from avtorch.inference.latent_form import LatentForm
-from avtorch.inference.sghmc import SGHMC
 from avtorch.inference.sgld import SGLD
-from tests.inference.device_cases import DENSITIES, F64, jerk_density, jerk_points, position_lag, rows, same
+from benchmarks.bias.control_variates import ControlVariates
+from benchmarks.peers.conjugate import sample_conjugate
+from tests.inference.device_cases import DENSITIES, F64, jerk_density, jerk_points, rows, same
 from tests.other_device import ELSEWHERE, Elsewhere, OtherDevice, Strayed
 
 EAGER = SamplerSettings(chains=16, draws=4, walk="eager", attempts=1)
@@ -148,11 +147,10 @@ def test_the_walk_waits_for_no_number(elsewhere: OtherDevice) -> None:
     assert fetched[1] == fetched[0]
 
 
-@pytest.mark.parametrize("optimizer", [SGLD, SGHMC])
-def test_optimizers_resume_there(optimizer: Any, elsewhere: OtherDevice) -> None:
+def test_optimizers_resume_there(elsewhere: OtherDevice) -> None:
     def made() -> tuple[Tensor, Any]:
         theta = torch.ones(5, dtype=F64, device=ELSEWHERE).requires_grad_()
-        return theta, optimizer([theta], lr=0.1, generator=torch.Generator(device=ELSEWHERE).manual_seed(1))
+        return theta, SGLD([theta], lr=0.1, generator=torch.Generator(device=ELSEWHERE).manual_seed(1))
 
     def step(theta: Tensor, by: Any) -> None:
         by.step(lambda: 0.5 * theta.square().sum())
@@ -171,18 +169,17 @@ def test_optimizers_resume_there(optimizer: Any, elsewhere: OtherDevice) -> None
 
 
 @pytest.mark.parametrize(
-    ("optimizer", "options"),
+    "options",
     [
-        (SGLD, {"noise": "averaged", "foreach": True}),
-        (SGLD, {"preconditioner": "rmsprop", "chain_dims": 1, "noise_dtype": torch.float32}),
-        (SGHMC, {}),
+        {"noise": "averaged", "foreach": True},
+        {"preconditioner": "rmsprop", "chain_dims": 1, "noise_dtype": torch.float32},
     ],
 )
-def test_optimizers_walk_there_as_here(optimizer: Any, options: dict[str, Any], elsewhere: OtherDevice) -> None:
+def test_optimizers_walk_there_as_here(options: dict[str, Any], elsewhere: OtherDevice) -> None:
     walked = []
     for device in ("cpu", ELSEWHERE):
         theta = torch.linspace(-1, 1, 8, dtype=F64).to(device).requires_grad_()
-        by = optimizer([theta], lr=0.1, generator=torch.Generator(device=device).manual_seed(4), **options)
+        by = SGLD([theta], lr=0.1, generator=torch.Generator(device=device).manual_seed(4), **options)
         for _ in range(3):
             by.step(lambda theta=theta: theta**4 / 4)
         walked.append(theta.detach())
@@ -190,7 +187,7 @@ def test_optimizers_walk_there_as_here(optimizer: Any, options: dict[str, Any], 
 
 
 def test_importance_draws_are_those_of_the_processor(elsewhere: OtherDevice) -> None:
-    here, there = position_lag("cpu"), position_lag(ELSEWHERE)
+    here, there = jerk_density("cpu"), jerk_density(ELSEWHERE)
     g = torch.Generator().manual_seed(0), torch.Generator(device=ELSEWHERE).manual_seed(0)
     expected, found = weighted_draws(here, generator=g[0]), weighted_draws(there, generator=g[1])
     same(found.z, expected.z, 1e-4)

@@ -28,7 +28,7 @@ from avtorch.inference import (
 from avtorch.inference.exactness import exactness
 from avtorch.inference.pareto import pareto_k
 from avtorch.inference.posterior import effective_sample_size, normal_scores
-from avtorch.inference.schedules import harmonic
+from avtorch.inference.sgld import harmonic
 from avtorch.validation.windows import synthetic_windows
 from tests.bars import BAR
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from avtorch.inference.latent import LatentDensity, LatentWindow
-from avtorch.inference.latent_excitation import REFERENCE_NOISE, latent_excitation
+from avtorch.inference.latent_form import REFERENCE_NOISE, latent_excitation
 
 TIME = 0.01 * torch.arange(1000, dtype=torch.float64)
 

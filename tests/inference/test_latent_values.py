@@ -1,21 +1,13 @@
-"""The likelihood's values without a graph, compiled and not, against the routes that have one, and what is differenced
-from them."""
+"""The compiled likelihood against the filter in torch, and what is differenced from its values."""
 
 from __future__ import annotations
-
-from types import ModuleType
 
 import pytest
 import torch
 from torch import Tensor
 
-from avtorch.inference.kernel_loading import Unavailable, load_kernels
-from avtorch.inference.latent import LatentDensity, LatentWindow, even_rows
-from avtorch.inference.latent_compiled import compiled_values
-from avtorch.inference.latent_filter import latent_log_likelihood
-from avtorch.inference.latent_rows import row_values
-from avtorch.inference.latent_steady import EvenRows, steady_log_likelihood
-from avtorch.inference.latent_values import steady_values
+from avtorch.inference.latent import LatentDensity, LatentWindow, compiled_log_likelihood, even_steps
+from avtorch.inference.latent_model import latent_log_likelihood
 from avtorch.inference.map import _from_graph, _from_values, find_mode
 from tests.inference.latent_windows import drawn_window
 
@@ -38,27 +30,6 @@ def parameters(generator: torch.Generator, *shape: int) -> tuple[tuple[Tensor, .
     return tuple(five), {"accel_noise": accel, "speed_noise": speed, "road_noise": road}
 
 
-def kernels() -> ModuleType:
-    found = load_kernels("latent_kernels")
-    if isinstance(found, Unavailable):
-        pytest.skip(found.why)
-    return found
-
-
-@CHANNELS
-@pytest.mark.parametrize("rows", [1, 2, 31, 33, 250])
-def test_even_values_equal_those_with_a_graph(channels: str, rows: int, fresh_seed: int) -> None:
-    generator = torch.Generator().manual_seed(fresh_seed)
-    u, measured = signals(channels, 2, 250, generator)
-    used = torch.ones(2, 250, dtype=torch.bool)
-    used[1, rows:] = False
-    data = EvenRows.build(torch.tensor([0.02, 0.1], dtype=torch.float64), u, used, **measured)
-    five, noise = parameters(generator, 3, 2)
-    found = steady_values(*five, data, **noise)
-    # the tolerance of the graph's own route against the filter: the diffuse start cancels about seven digits
-    torch.testing.assert_close(found, steady_log_likelihood(*five, data, **noise), rtol=1e-9, atol=1e-8)
-
-
 @CHANNELS
 @pytest.mark.parametrize("jitter", [0.0, 0.4, 1.9])
 @pytest.mark.parametrize("draws", [1, 8, 19])
@@ -70,11 +41,11 @@ def test_compiled_values_equal_those_of_the_filter(channels: str, jitter: float,
     used = torch.ones(2, 80, dtype=torch.bool)
     used[1, 33:] = False
     runs = LatentWindow(steps.cumsum(-1), u, measured["accel"], measured["speed"], used)
-    even = even_rows(runs) if jitter == 0 else None
+    even = even_steps(runs) if jitter == 0 else None
     assert (even is None) == (jitter > 0)
     five, noise = parameters(generator, draws, 2)
     given = {name: x for name, x in noise.items() if channels == "both" or channels in name or name == "road_noise"}
-    found = compiled_values(kernels(), *five, runs, even, **given)
+    found = compiled_log_likelihood(*five, runs, even, **given)
     exact = latent_log_likelihood(*five, runs.time, u, mask=used, **measured, **noise)
     torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-8)
 
@@ -84,7 +55,7 @@ def test_compiled_values_of_a_single_row(fresh_seed: int) -> None:
     u, measured = signals("both", 1, 1, generator)
     runs = LatentWindow(torch.zeros(1, 1, dtype=torch.float64), u, mask=torch.ones(1, 1, dtype=torch.bool), **measured)
     five, noise = parameters(generator, 3, 1)
-    found = compiled_values(kernels(), *five, runs, None, **noise)
+    found = compiled_log_likelihood(*five, runs, None, **noise)
     exact = latent_log_likelihood(*five, runs.time, u, **measured, **noise)
     torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-8)
 
@@ -97,35 +68,23 @@ def test_compiled_values_say_where_there_is_none(fresh_seed: int) -> None:
         0.02 * torch.arange(50, dtype=torch.float64)[None], u, mask=torch.ones(1, 50, dtype=torch.bool), **measured
     )
     five, noise = parameters(generator, 9, 1)
-    before = compiled_values(kernels(), *five, runs, even_rows(runs), **noise)
+    before = compiled_log_likelihood(*five, runs, even_steps(runs), **noise)
     five[0][4] = torch.nan
-    after = compiled_values(kernels(), *five, runs, even_rows(runs), **noise)
+    after = compiled_log_likelihood(*five, runs, even_steps(runs), **noise)
     assert bool(after[4].isnan().all())
     others = torch.arange(9) != 4
     assert torch.equal(before[others], after[others])
 
 
-@CHANNELS
-@pytest.mark.parametrize("jitter", [0.0, 0.4, 1.9])
-def test_values_of_uneven_rows_equal_those_of_the_filter(channels: str, jitter: float, fresh_seed: int) -> None:
-    generator = torch.Generator().manual_seed(fresh_seed)
-    u, measured = signals(channels, 1, 80, generator)
-    steps = 0.02 * (1 + jitter * (torch.rand(80, generator=generator, dtype=torch.float64) - 0.5))
-    five, noise = parameters(generator, 5)
-    found = row_values(*five, steps.cumsum(0), u[0], **measured, **noise)
-    exact = latent_log_likelihood(*five, steps.cumsum(0), u, **measured, **noise)
-    torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-8)
-
-
-def test_runs_under_one_clock_are_taken_together_without_a_change(fresh_seed: int) -> None:
-    """Uneven windows under the same clock and command, one by one and stacked."""
+def test_windows_are_what_they_are_alone(fresh_seed: int) -> None:
+    """Uneven windows, one by one and stacked."""
     generator = torch.Generator().manual_seed(fresh_seed)
     u, measured = signals("both", 3, 40, generator)
     time = (0.02 * (1 + 0.8 * torch.rand(40, generator=generator, dtype=torch.float64))).cumsum(0).expand(3, -1)
     same = u[:1].expand(3, -1)
     windows = LatentWindow(time, same, measured["accel"], measured["speed"], torch.ones(3, 40, dtype=torch.bool))
     density = LatentDensity(windows)
-    assert density.approximation() is density or density._even is None
+    assert density.approximation() is density or density._steps is None
     z = density.initial() + 0.1 * torch.randn(4, 3, len(density.names), generator=generator, dtype=torch.float64)
     with torch.no_grad():
         together = density.log_prob(z)
@@ -146,13 +105,15 @@ def test_derivatives_from_values_are_those_of_the_graph(jitter: float, fresh_see
     assert float((potential - exact[0]).abs().max()) < 1e-7
     assert float((gradient - exact[1]).abs().max()) < 10 * 2e-3**2 * scale + 1e-4
     assert float((hessian - exact[2]).abs().max()) < 10 * 2e-3**2 * scale + 0.05
+    # those that a walk follows, from values nearer by
+    assert float((density.score(z) + exact[1]).abs().max()) < 10 * 1e-4**2 * scale + 1e-4
 
 
 @pytest.mark.slow
 def test_the_mode_from_values_is_the_mode(fresh_seed: int) -> None:
     generator = torch.Generator().manual_seed(fresh_seed)
     density, _ = drawn_window(generator, accel=True, speed=True, rows=100, dt=0.02)
-    quick, exact = find_mode(density, from_values=True), find_mode(density)
+    quick, exact = find_mode(density), find_mode(density, from_values=False)
     off = torch.linalg.solve_triangular(exact.scale, (quick.z - exact.z)[..., None], upper=False)
     # a hundredth of an SD, a fifth of what 400 effective draws leave open
     assert float(off.norm()) < 1e-2

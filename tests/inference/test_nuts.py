@@ -14,7 +14,6 @@ pytest.importorskip("pyro")
 
 from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, find_mode
-from avtorch.inference.conjugate import sample_conjugate
 from avtorch.inference.latent import LatentDensity, LatentWindow, default_noise_prior
 from avtorch.inference.nuts import PositiveNormal, PyroModel, nuts
 from avtorch.inference.priors import (
@@ -27,6 +26,7 @@ from avtorch.inference.priors import (
     default_jerk_noise_prior,
 )
 from avtorch.inference.quadrature import integrate
+from benchmarks.peers.conjugate import sample_conjugate
 from tests.bars import BAR
 
 F64 = torch.float64

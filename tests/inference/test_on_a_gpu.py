@@ -11,7 +11,6 @@ import torch
 from avtorch.inference import BeliefStream, SamplerSettings, find_mode, integrate, sample
 from avtorch.inference.estimators import ESTIMATORS
 from avtorch.inference.importance import weighted_draws
-from avtorch.inference.sghmc import SGHMC
 from avtorch.inference.sgld import SGLD
 from tests.inference.device_cases import DENSITIES, F64, jerk_density, rows, same
 
@@ -78,7 +77,7 @@ def test_on_a_gpu_sample(name: str, settings: SamplerSettings) -> None:
 @CUDA
 @pytest.mark.parametrize(
     ("optimizer", "options"),
-    [(SGLD, {}), (SGLD, {"noise": "averaged", "noise_dtype": torch.float32}), (SGLD, {"foreach": True}), (SGHMC, {})],
+    [(SGLD, {}), (SGLD, {"noise": "averaged", "noise_dtype": torch.float32}), (SGLD, {"foreach": True})],
 )
 def test_on_a_gpu_optimizers(optimizer: Any, options: dict[str, Any]) -> None:
     """A step without noise is the processor's; with noise the law is; and a state gives the same draws again."""

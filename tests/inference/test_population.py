@@ -1,4 +1,4 @@
-"""Partial pooling: the joint density and its margin agree, and SGLD agrees with NUTS over Pyro's own statements."""
+"""Partial pooling: the margin is that of the model, and SGLD agrees with NUTS over Pyro's own statements."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference import PopulationDensity, PopulationMargin, sample
+from avtorch.inference import PopulationMargin, sample
 from avtorch.inference.population import MEAN_SD, SPREAD
 from tests.bars import BAR
 
@@ -31,34 +31,24 @@ def points(seed: int, d: int) -> Tensor:
 
 
 @pytest.mark.parametrize("once", [False, True])
-def test_the_joint_is_the_margin_times_its_conditional(once: bool) -> None:
-    y, sd = fleet(1)
+def test_the_density_is_the_model_s(once: bool) -> None:
+    """Drives of a car share its distance from the mean: by one normal of all drives, and the priors as they stand."""
+    y, sd = fleet(3)
     car = torch.arange(6) if once else CAR
     y, sd = y[:, : len(car)], sd[:, : len(car)]
-    joint, margin = PopulationDensity(y, sd, car), PopulationMargin(y, sd, car)
-    assert joint.names[: len(margin.names)] == margin.names
-    assert margin.names == (("mean", "between") if once else ("mean", "between", "within"))
-    z = points(2, 9)[..., 1 if once else 0 :]
-    conditional = torch.distributions.Normal(0.0, 1.0).log_prob(z[..., len(margin.names) :]).sum(-1)
-    expected = margin.log_prob(z[..., : len(margin.names)]) + conditional
-    torch.testing.assert_close(joint.log_prob(z), expected, rtol=1e-10, atol=1e-9)
-
-
-def test_the_density_is_the_model_s() -> None:
-    """By plain normals at the parameters themselves, with the Jacobian by automatic differentiation."""
-    y, sd = fleet(3)
-    joint = PopulationDensity(y[:1], sd[:1], CAR)
-    z = points(4, 9)[0, :1]
-    mean, between, within, *cars = joint.constrain(z)[0]
-    theta = torch.stack(cars)
-    normal, gamma = torch.distributions.Normal, torch.distributions.Gamma
-    zero, two = torch.zeros((), dtype=F64), torch.full((), 2.0, dtype=F64)
-    said = normal(zero, MEAN_SD).log_prob(mean)
-    said = said + gamma(two, 2 / SPREAD).log_prob(torch.stack([between, within])).sum()
-    said = said + normal(mean, between).log_prob(theta).sum()
-    said = said + normal(theta[CAR], (sd[0] ** 2 + within**2).sqrt()).log_prob(y[0]).sum()
-    jacobian = torch.autograd.functional.jacobian(lambda x: joint.constrain(x[None])[0], z[0])
-    torch.testing.assert_close(joint.log_prob(z)[0], said + torch.linalg.slogdet(jacobian)[1], rtol=1e-10, atol=1e-9)
+    density = PopulationMargin(y, sd, car)
+    assert density.names == (("mean", "between") if once else ("mean", "between", "within"))
+    z = points(4, 3)[0, :, : len(density.names)]
+    mean, between, *rest = density.constrain(z).unbind(-1)
+    within = rest[0] if rest else torch.zeros_like(mean)
+    shared = (car[:, None] == car).double() * between[:, None, None] ** 2
+    spread = shared + torch.diag_embed(sd**2 + within[:, None] ** 2)
+    said = torch.distributions.MultivariateNormal(mean[:, None].expand_as(y), spread).log_prob(y)
+    said = said + torch.distributions.Normal(torch.zeros((), dtype=F64), MEAN_SD).log_prob(mean)
+    gamma = torch.distributions.Gamma(torch.full((), 2.0, dtype=F64), 2 / SPREAD)
+    # the Jacobian of a logarithm is the spread itself
+    said = said + sum(gamma.log_prob(x) + x.log() for x in (between, *rest))
+    torch.testing.assert_close(density.log_prob(z), said, rtol=1e-10, atol=1e-9)
 
 
 def test_a_car_with_little_data_is_drawn_to_its_siblings() -> None:
@@ -77,14 +67,14 @@ def test_a_car_with_little_data_is_drawn_to_its_siblings() -> None:
 
 @pytest.mark.statistical
 @pytest.mark.slow
-def test_sgld_over_the_joint_density_agrees_with_nuts(rotating_seed: int) -> None:
+def test_sgld_agrees_with_nuts(rotating_seed: int) -> None:
     """NUTS walks the model as Pyro is told it, in coordinates that the density does not use."""
     pyro = pytest.importorskip("pyro")
     from pyro import distributions as dist
     from pyro.infer import MCMC, NUTS
 
     y, sd = fleet(rotating_seed)
-    density = PopulationDensity(y[:1], sd[:1], CAR)
+    density = PopulationMargin(y[:1], sd[:1], CAR)
     walked = sample(density, generator=torch.Generator().manual_seed(rotating_seed))
     assert walked.draws.isfinite().all()
 
@@ -100,8 +90,7 @@ def test_sgld_over_the_joint_density_agrees_with_nuts(rotating_seed: int) -> Non
         run = MCMC(NUTS(model, target_accept_prob=0.9), 1500, 500, disable_progbar=True)
         run.run()
     found = run.get_samples()
-    cars = found["mean"][:, None] + found["spreads"][:, :1] * found["away"]
-    nuts = torch.cat([found["mean"][:, None], found["spreads"].sqrt(), cars], -1)
+    nuts = torch.cat([found["mean"][:, None], found["spreads"].sqrt()], -1)
     ours = walked.draws[:, :, 0].clone()
     # spreads have a long tail to the right, their logarithms one to the left, in which 1,500 draws settle no square
     ours[..., 1:3] = ours[..., 1:3].sqrt()

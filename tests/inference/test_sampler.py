@@ -21,7 +21,7 @@ from avtorch.inference import (
 from avtorch.inference.coordinates import Coordinates, stiffness
 from avtorch.inference.priors import Joint, QuadrantNormal, default_jerk_noise_prior
 from avtorch.inference.sampler import walk
-from avtorch.inference.schedules import harmonic, polynomial
+from avtorch.inference.sgld import harmonic, polynomial
 from tests.bars import BAR
 
 F64 = torch.float64

@@ -13,7 +13,7 @@ from torch.optim.lr_scheduler import CosineAnnealingLR, ExponentialLR, StepLR
 
 from avtorch.errors import InputError
 from avtorch.inference import SGLD
-from avtorch.inference.schedules import harmonic, polynomial
+from avtorch.inference.sgld import harmonic, polynomial
 
 F64 = torch.float64
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference import BeliefStream, SamplerSettings, SpeedLagForm
+from avtorch.inference import BeliefStream, SamplerSettings
 from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.stream_units import StreamUnits
 from avtorch.io import Log
@@ -235,14 +235,6 @@ def test_the_memory_of_a_stretch_is_bounded():
         found.take({"time": time + 2.0 * k, "usable": usable, **dict.fromkeys(JERK, zero)}, {})
         kept.append(found.rows["time"].shape[-1] if found.rows else 0)
     assert max(kept) < 40 / 0.05 + 50
-
-
-def test_forms_without_a_command_in_acceleration_are_checked_by_what_they_have(fresh_seed):
-    time, given = drive(fresh_seed, seconds=20.0)
-    rows = {**given, "speed_cmd": given["speed"]}
-    watch(SpeedLagForm.columns, time, rows)
-    with pytest.raises(InputError, match=r"speed is in km/h"):
-        watch(SpeedLagForm.columns, time, changed(rows, speed=3.6))
 
 
 @pytest.mark.parametrize("lap", [1, 2, 3])

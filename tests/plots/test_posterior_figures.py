@@ -12,10 +12,9 @@ from matplotlib.text import Text
 
 from avtorch import plots
 from avtorch.inference import Posterior, SamplerSettings, integrate
-from avtorch.validation.agreement import agreement, between
-from avtorch.validation.agreement_verdict import AgreementVerdict
+from avtorch.validation.agreement import AgreementVerdict, agreement, between
 from avtorch.validation.calibration import RankCalibration
-from avtorch.validation.exact import exact_draws
+from avtorch.validation.reference import exact_draws
 from avtorch.validation.stein import Stein
 from avtorch.validation.validate import Validation
 from avtorch.validation.windows import synthetic_windows

@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference import ExcitationRule, JerkDensity, sample_conjugate
+from avtorch.inference import ExcitationRule, JerkDensity
 from avtorch.inference.priors import LogNormalPrior
-from avtorch.validation.calibration import sbc, sbc_loop, sbc_quadrature
-from avtorch.validation.ranks import RankCalibration
+from avtorch.validation.calibration import RankCalibration, sbc_quadrature
 from avtorch.validation.simulation import simulate_windows, sine_commands, statistics
+from benchmarks.calibration import sbc, sbc_loop
+from benchmarks.peers.conjugate import sample_conjugate
 from tests.bars import BAR, LEVEL
 
 F64 = torch.float64

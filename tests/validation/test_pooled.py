@@ -9,7 +9,8 @@ import torch
 
 from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, JerkStatistics, integrate
-from avtorch.validation.pooled import (
+from avtorch.validation.simulation import simulate_windows, sine_commands
+from benchmarks.pooled import (
     FreeNoise,
     PooledComparison,
     constant,
@@ -20,7 +21,6 @@ from avtorch.validation.pooled import (
     truth_given_all,
     windows_of,
 )
-from avtorch.validation.simulation import simulate_windows, sine_commands
 
 F64 = torch.float64
 

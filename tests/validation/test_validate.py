@@ -11,17 +11,17 @@ import pytest
 import torch
 
 from avtorch.errors import InputError
-from avtorch.inference import JerkDensity, Posterior, Quadrature, SamplerSettings, integrate, sample_conjugate
+from avtorch.inference import JerkDensity, Posterior, Quadrature, SamplerSettings, integrate
 from avtorch.io import write_json
 from avtorch.results import validation_answer
+from benchmarks.peers.conjugate import sample_conjugate
 
 pytest.importorskip("arviz")
 
 from avtorch.validation import agreement, synthetic_windows, validate
-from avtorch.validation.agreement_verdict import agreement_verdict, chi2_of_means
-from avtorch.validation.exact import exact_draws
-from avtorch.validation.reference import NODES, join, reference, select
-from avtorch.validation.validate import NutsSettings, Validation, check_installed
+from avtorch.validation.agreement import agreement_verdict, chi2_of_means
+from avtorch.validation.reference import NODES, NutsSettings, exact_draws, join, reference, select
+from avtorch.validation.validate import Validation, check_installed
 from avtorch.validation.windows import Windows
 from tests.bars import BAR, LEVEL
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from avtorch.errors import InputError
-from avtorch.inference import BeliefStream, JerkDensity, sample_conjugate
+from avtorch.inference import BeliefStream, JerkDensity
 from avtorch.io import Log
 from avtorch.validation.windows import (
     AMPLITUDE,
@@ -21,6 +21,7 @@ from avtorch.validation.windows import (
     windows_of_log,
 )
 from avtorch.vehicle import GLVDPlant, Leader, simulate
+from benchmarks.peers.conjugate import sample_conjugate
 from tests.bars import BAR
 
 

@@ -2,12 +2,11 @@
 squares and joint Kalman filters."""
 
 from avtorch.inference.estimators.choose import ESTIMATORS, make_estimator
-from avtorch.inference.estimators.contract import Estimator
-from avtorch.inference.estimators.ekf import JointEKF
 from avtorch.inference.estimators.importance import ImportanceSampling
+from avtorch.inference.estimators.kalman import JointEKF, JointUKF
 from avtorch.inference.estimators.map import MaximumAPosteriori
 from avtorch.inference.estimators.rls import RecursiveLeastSquares
-from avtorch.inference.estimators.ukf import JointUKF
+from avtorch.inference.estimators.windowed import Estimator
 
 __all__ = [
     "ESTIMATORS",

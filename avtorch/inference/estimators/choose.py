@@ -6,13 +6,11 @@ import inspect
 from typing import Any
 
 from avtorch.errors import InputError
-from avtorch.inference.estimators.contract import Estimator
-from avtorch.inference.estimators.ekf import JointEKF
 from avtorch.inference.estimators.importance import ImportanceSampling
+from avtorch.inference.estimators.kalman import JointEKF, JointUKF
 from avtorch.inference.estimators.map import MaximumAPosteriori
 from avtorch.inference.estimators.rls import RecursiveLeastSquares
-from avtorch.inference.estimators.ukf import JointUKF
-from avtorch.inference.estimators.windowed import WindowedEstimator
+from avtorch.inference.estimators.windowed import Estimator, WindowedEstimator
 from avtorch.inference.form import Form
 from avtorch.inference.sequential import SequentialInference
 

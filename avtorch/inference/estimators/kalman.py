@@ -1,11 +1,24 @@
-"""Joint Kalman filters: state and parameters in one normal belief, row by row, all vehicles at once."""
+r"""Joint Kalman filters: state and parameters in one normal belief, row by row, all vehicles at once.
+
+The extended filter (Jazwinski 1970) replaces the model by its tangent at the mean:
+
+.. math::
+    \bar x = f(x),\quad \bar P = F P F^\top + Q, \qquad
+    x^+ = \bar x + k\,(y - h(\bar x)),\quad P^+ = \bar P - k s k^\top,\quad
+    s = H \bar P H^\top + r,\ k = \bar P H^\top / s
+
+The unscented filter (Julier and Uhlmann 1997, ``kappa = 0``) passes 2d points of equal weight, :math:`x \pm \sqrt{d}\,
+L_i` with ``L`` the Cholesky factor of the covariance, through the model itself; mean and covariance of the transformed
+points are the prediction. Positive weights keep every covariance positive, and there is no tuning parameter.
+"""
 
 from __future__ import annotations
 
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -13,18 +26,188 @@ from torch import Tensor
 from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.inference.belief import Summary
-from avtorch.inference.estimators.jerk_state import JerkState
-from avtorch.inference.estimators.latent_state import LatentState
-from avtorch.inference.estimators.state_model import GaussianState, Observation, StateModel
 from avtorch.inference.estimators.windowed import WindowedEstimator
 from avtorch.inference.form import Form, JerkForm, Rows
 from avtorch.inference.jerk import JerkStatistics
 from avtorch.inference.latent import NOISE_PRIOR
 from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, Step, discretise, initial_covariance
 from avtorch.inference.latent_window import GAP
 
 PLAUSIBLE = ((0.01, 20.0), (0.02, 20.0))
 """Bounds of ``T_L`` [s] and ``K_L``; a filter that leaves them has diverged, and restarts from the prior."""
+
+_ROWS = {"speed": SPEED_ROW, "accel": ACCEL_ROW}
+
+
+class GaussianState(NamedTuple):
+    """A normal state: ``mean`` ``(vehicle, d)``, ``cov`` ``(vehicle, d, d)``; the last two are ``log T_L, log K_L``."""
+
+    mean: Float[Tensor, "vehicle d"]
+    cov: Float[Tensor, "vehicle d d"]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One row of every vehicle.
+
+    ``u`` and ``a``: demanded and, where it is known exactly, realised acceleration [m/s²], ``(vehicle,)``;
+    ``measured``: ``(vehicle, channel)``; ``dt``: to the next row [s].
+    """
+
+    u: Float[Tensor, " vehicle"]
+    a: Float[Tensor, " vehicle"]
+    measured: Float[Tensor, "vehicle channel"]
+    dt: Float[Tensor, ""]
+
+
+class StateModel(Protocol):
+    """A state-space model, batched over vehicles; ``x`` is ``(..., vehicle, d)``."""
+
+    @property
+    def variance(self) -> Float[Tensor, "vehicle channel"]:
+        """Variance of every channel's noise, ``(vehicle, channel)``."""
+        ...
+
+    def start(self, actuation: GaussianState, row: Observation) -> GaussianState:
+        """The state at the first row of a run, given the belief in ``(log T_L, log K_L)``."""
+        ...
+
+    def advance(self, x: Float[Tensor, "*point vehicle d"], row: Observation) -> Float[Tensor, "*point vehicle d"]:
+        """The state a step later without noise, shape of ``x``."""
+        ...
+
+    def slope(self, x: Float[Tensor, "*point vehicle d"], row: Observation) -> Float[Tensor, "*point vehicle d d"]:
+        """Derivative of :meth:`advance`, ``(..., vehicle, d, d)``."""
+        ...
+
+    def noise(self, x: Float[Tensor, "vehicle d"], row: Observation) -> Float[Tensor, "*vehicle d d"]:
+        """Covariance of the step's noise, ``(vehicle, d, d)``, at ``x`` ``(vehicle, d)``."""
+        ...
+
+    def observe(
+        self, x: Float[Tensor, "*point vehicle d"], row: Observation, channel: int
+    ) -> Float[Tensor, "*point vehicle"]:
+        """The channel's reading without noise, ``(..., vehicle)``."""
+        ...
+
+    def observed_slope(
+        self, x: Float[Tensor, "*point vehicle d"], row: Observation, channel: int
+    ) -> Float[Tensor, "*point vehicle d"]:
+        """Derivative of :meth:`observe`, ``(..., vehicle, d)``."""
+        ...
+
+
+class JerkState:
+    """``(log T_L, log K_L)`` as a random walk, observed through Eq. 1: ``jerk = (K_L u - a)/T_L + N(0, sigma^2)``.
+
+    Args:
+        sigma: jerk noise [m/s³], ``(vehicle,)``.
+        drift: SD of the walk per square root of a second, of both logarithms.
+    """
+
+    def __init__(self, sigma: Float[Tensor, " vehicle"], drift: float) -> None:
+        self.variance = sigma.square().unsqueeze(-1)
+        self._walk = drift**2 * torch.eye(2, dtype=sigma.dtype, device=sigma.device)
+        self._still = torch.eye(2, dtype=sigma.dtype, device=sigma.device)
+
+    def start(self, actuation: GaussianState, row: Observation) -> GaussianState:
+        return actuation
+
+    def advance(self, x: Float[Tensor, "*point vehicle 2"], row: Observation) -> Float[Tensor, "*point vehicle 2"]:
+        return x
+
+    def slope(self, x: Float[Tensor, "*point vehicle 2"], row: Observation) -> Float[Tensor, "*point vehicle 2 2"]:
+        return self._still.expand(*x.shape, 2)
+
+    def noise(self, x: Float[Tensor, "vehicle 2"], row: Observation) -> Float[Tensor, "2 2"]:
+        return row.dt * self._walk
+
+    def observe(
+        self, x: Float[Tensor, "*point vehicle 2"], row: Observation, channel: int
+    ) -> Float[Tensor, "*point vehicle"]:
+        log_T, log_K = x.unbind(-1)
+        return (log_K.exp() * row.u - row.a) * (-log_T).exp()
+
+    def observed_slope(
+        self, x: Float[Tensor, "*point vehicle 2"], row: Observation, channel: int
+    ) -> Float[Tensor, "*point vehicle 2"]:
+        by_gain = (x[..., 1] - x[..., 0]).exp() * row.u
+        return torch.stack([(-x[..., 0]).exp() * row.a - by_gain, by_gain], -1)
+
+
+class LatentState:
+    """``(v, a, c, e, log T_L, log K_L)``: the model of :mod:`avtorch.inference.latent_model`, parameters on a walk.
+
+    With the parameters known and at rest the filter's log likelihood is that of the latent form, exactly.
+
+    Args:
+        measured: the channels, some of ``"accel"``, ``"speed"``.
+        noise: the latent form's noise parameters by name; a filter takes them as given.
+        drift: SD of the parameters' walk per square root of a second, of both logarithms.
+        vehicles: how many. device: where their rows are.
+    """
+
+    def __init__(
+        self,
+        measured: tuple[str, ...],
+        noise: Mapping[str, float],
+        drift: float,
+        vehicles: int,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.measured, self.drift = measured, drift
+        self._noise = {name: torch.tensor(value, dtype=torch.float64, device=device) for name, value in noise.items()}
+        variances = torch.stack([self._noise[f"{name}_noise"].square() for name in measured])
+        self.variance = variances.expand(vehicles, -1)
+        self._rows = [torch.tensor((*_ROWS[name], 0.0, 0.0), dtype=torch.float64, device=device) for name in measured]
+
+    def start(self, actuation: GaussianState, row: Observation) -> GaussianState:
+        vehicles = len(actuation.mean)
+        mean, cov = actuation.mean.new_zeros(vehicles, 6), actuation.mean.new_zeros(vehicles, 6, 6)
+        mean[:, 4:], cov[:, 4:, 4:] = actuation
+        if "speed" in self.measured:
+            mean[:, 0] = row.measured[:, self.measured.index("speed")]
+        cov[:, :4, :4] = initial_covariance(self._noise["coloured_sd"], self._noise["coloured_time"])
+        return GaussianState(mean, cov)
+
+    def _step(self, x: Tensor, row: Observation) -> Step:
+        n = self._noise
+        road = n.get("road_noise", row.dt.new_zeros(()))
+        parameters = (n["process_noise"], road, n["coloured_sd"], n["coloured_time"])
+        return discretise(x[..., 4].exp(), x[..., 5].exp(), *parameters, row.dt)
+
+    def advance(self, x: Float[Tensor, "*point vehicle 6"], row: Observation) -> Float[Tensor, "*point vehicle 6"]:
+        step = self._step(x, row)
+        moved = (step.transition @ x[..., :4, None])[..., 0] + step.gain * row.u[:, None]
+        return torch.cat([moved, x[..., 4:]], -1)
+
+    def slope(self, x: Float[Tensor, "*point vehicle 6"], row: Observation) -> Float[Tensor, "*point vehicle 6 6"]:
+        step = self._step(x, row)
+        a, K, u = x[..., 1], x[..., 5].exp(), row.u
+        decay, reach = step.transition[..., 1, 1], step.transition[..., 0, 1]
+        out = torch.diag_embed(torch.ones_like(x))
+        out[..., :4, :4] = step.transition
+        out[..., 0, 4] = (reach - decay * row.dt) * (a - K * u)
+        out[..., 1, 4] = decay * row.dt * (-x[..., 4]).exp() * (a - K * u)
+        out[..., :2, 5] = step.gain[..., :2] * u[:, None]
+        return out
+
+    def noise(self, x: Float[Tensor, "vehicle 6"], row: Observation) -> Float[Tensor, "vehicle 6 6"]:
+        out = x.new_zeros(*x.shape, 6)
+        out[..., :4, :4] = self._step(x, row).noise
+        out[..., 4, 4] = out[..., 5, 5] = self.drift**2 * row.dt
+        return out
+
+    def observe(
+        self, x: Float[Tensor, "*point vehicle 6"], row: Observation, channel: int
+    ) -> Float[Tensor, "*point vehicle"]:
+        return x @ self._rows[channel]
+
+    def observed_slope(
+        self, x: Float[Tensor, "*point vehicle 6"], row: Observation, channel: int
+    ) -> Float[Tensor, "*point vehicle 6"]:
+        return self._rows[channel].expand_as(x)
 
 
 class JointKalman(WindowedEstimator):
@@ -159,3 +342,86 @@ def _plausible(actuation: GaussianState) -> Tensor:
 def _where(on: Tensor, state: GaussianState, other: GaussianState) -> GaussianState:
     mean = torch.where(on[:, None], state.mean, other.mean)
     return GaussianState(mean, torch.where(on[:, None, None], state.cov, other.cov))
+
+
+class JointEKF(JointKalman):
+    """One tangent a row: cheap, and overconfident where the belief is wide against the model's curvature.
+
+    Example:
+        >>> from avtorch import BeliefStream, GLVDPlant, Leader, simulate
+        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
+        >>> rows = {"accel": run.accel[:, 0], "accel_cmd": run.accel_cmd[:, 0], "jerk": run.jerk[:, 0]}
+        >>> stream = BeliefStream(check_units=False, estimator="ekf", drift=0.02)  # made of JointEKF
+        >>> [round(w.belief.stat("K_L")["mean"], 1) for w in stream.feed(run.time, rows) + stream.flush()]
+        [0.9, 0.9]
+    """
+
+    def predict(self, model: StateModel, state: GaussianState, row: Observation) -> GaussianState:
+        slope = model.slope(state.mean, row)
+        cov = slope @ state.cov @ slope.mT + model.noise(state.mean, row)
+        return GaussianState(model.advance(state.mean, row), cov)
+
+    def correct(
+        self, model: StateModel, state: GaussianState, row: Observation, channel: int
+    ) -> tuple[GaussianState, Float[Tensor, " vehicle"]]:
+        slope = model.observed_slope(state.mean, row, channel)
+        pointing = (state.cov @ slope.unsqueeze(-1)).squeeze(-1)
+        spread = (pointing * slope).sum(-1) + model.variance[:, channel]
+        innovation = row.measured[:, channel] - model.observe(state.mean, row, channel)
+        return gained(state, innovation, pointing, spread)
+
+
+class JointUKF(JointKalman):
+    """Second order in the mean and no derivatives, at ``2d`` runs of the model a row.
+
+    Example:
+        >>> from avtorch import BeliefStream, GLVDPlant, Leader, simulate
+        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
+        >>> rows = {"accel": run.accel[:, 0], "accel_cmd": run.accel_cmd[:, 0], "jerk": run.jerk[:, 0]}
+        >>> stream = BeliefStream(check_units=False, estimator="ukf", drift=0.02)  # made of JointUKF
+        >>> [round(w.belief.stat("K_L")["mean"], 1) for w in stream.feed(run.time, rows) + stream.flush()]
+        [0.9, 0.9]
+    """
+
+    def predict(self, model: StateModel, state: GaussianState, row: Observation) -> GaussianState:
+        points = model.advance(sigma_points(state), row)
+        mean = points.mean(0)
+        centred = points - mean
+        cov = torch.einsum("pvi,pvj->vij", centred, centred) / len(points) + model.noise(state.mean, row)
+        return GaussianState(mean, cov)
+
+    def correct(
+        self, model: StateModel, state: GaussianState, row: Observation, channel: int
+    ) -> tuple[GaussianState, Float[Tensor, " vehicle"]]:
+        points = sigma_points(state)
+        seen = model.observe(points, row, channel)
+        expected = seen.mean(0)
+        off = seen - expected
+        pointing = ((points - state.mean) * off.unsqueeze(-1)).mean(0)
+        spread = off.square().mean(0) + model.variance[:, channel]
+        return gained(state, row.measured[:, channel] - expected, pointing, spread)
+
+
+def gained(
+    state: GaussianState,
+    innovation: Float[Tensor, " vehicle"],
+    pointing: Float[Tensor, "vehicle d"],
+    spread: Float[Tensor, " vehicle"],
+) -> tuple[GaussianState, Float[Tensor, " vehicle"]]:
+    """The linear update: ``pointing`` ``(vehicle, d)`` is the covariance of state and reading, ``spread`` its variance.
+
+    Returns the state and the log likelihood of the reading, ``(vehicle,)``.
+    """
+    gain = pointing / spread.unsqueeze(-1)
+    mean = state.mean + gain * innovation.unsqueeze(-1)
+    cov = state.cov - gain.unsqueeze(-1) * pointing.unsqueeze(-2)
+    likelihood = -0.5 * (spread.log() + innovation.square() / spread + math.log(2 * math.pi))
+    return GaussianState(mean, 0.5 * (cov + cov.mT)), likelihood
+
+
+def sigma_points(state: GaussianState) -> Float[Tensor, "point vehicle d"]:
+    """``(2d, vehicle, d)``; not a number where the covariance has no Cholesky factor: the filter has diverged."""
+    root, failed = torch.linalg.cholesky_ex(state.cov)
+    root = torch.where((failed == 0)[:, None, None], root, torch.nan)
+    reach = math.sqrt(state.mean.shape[-1]) * root.movedim(-1, 0)
+    return torch.cat([state.mean + reach, state.mean - reach])

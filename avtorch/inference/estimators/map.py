@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from avtorch.inference.belief import Summary
-from avtorch.inference.density import Density, has_quick_values
+from avtorch.inference.density import Density
 from avtorch.inference.map import find_mode
 from avtorch.inference.sequential import SequentialInference
 
@@ -36,7 +36,7 @@ class MaximumAPosteriori(SequentialInference):
     """
 
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
-        mode = find_mode(density, from_values=has_quick_values(density))
+        mode = find_mode(density)
         converged = mode.converged & (mode.covariance.diagonal(dim1=-2, dim2=-1).amax(-1) < WIDEST**2)
         # the others are not used; any finite covariance will do
         covariance = torch.where(

@@ -1,9 +1,10 @@
-"""Shared by the recursive estimators: a belief per vehicle, carried over where a window is not excited, and resume."""
+"""The interface of an estimator in a stream of windows, and what the recursive ones share: a belief per vehicle, which
+is carried over where a window is not excited, and resume."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, Protocol
 
 from torch import Tensor
 
@@ -12,7 +13,36 @@ from avtorch.inference.belief import Belief, Summary
 from avtorch.inference.device import Device, checked_device, generator_on
 from avtorch.inference.form import Form, Rows, WindowLikelihood
 from avtorch.inference.priors import Joint, LogNormalPrior, default_actuation_prior, prior_on
-from avtorch.inference.state import about, generator_of, shaped_as
+from avtorch.inference.state import about, shaped_as
+
+
+class Estimator(Protocol):
+    """Takes the windows of many vehicles one after another and keeps a belief about them.
+
+    A window that is not excited leaves the belief of its vehicle as it was.
+
+    Example:
+        >>> from avtorch.inference import JerkForm
+        >>> from avtorch.inference.estimators import Estimator, make_estimator
+        >>> filters: list[Estimator] = [make_estimator(name, JerkForm()) for name in ("ekf", "ukf")]
+        >>> [f.belief.names for f in filters]
+        [('T_L', 'K_L', 'sigma'), ('T_L', 'K_L', 'sigma')]
+    """
+
+    @property
+    def belief(self) -> Belief:
+        """The belief after the last window; before the first, the first prior."""
+        ...
+
+    def take(self, rows: Rows, likelihood: WindowLikelihood) -> Belief:
+        """Take in one window: its rows, each column ``(vehicle, time)``, and what the form makes of them."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain tensors and names, from which a resumed estimator continues bit for bit."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
 
 
 class WindowedEstimator(ABC):
@@ -73,17 +103,13 @@ class WindowedEstimator(ABC):
         """Continue from :meth:`state_dict`.
 
         Raises:
-            InputError: if it was saved by an estimator of other parameters or vehicles, or has other shapes, types or
-                numbers than it saves; nothing is then changed.
+            InputError: if it was saved by an estimator of other parameters or vehicles, or has other shapes or
+                types than it saves; nothing is then changed.
         """
         saved, own = about(state), about(self.state_dict())
         if saved != own:
             raise InputError(f"state: (names, vehicles) were {saved} when it was saved, here they are {own}")
         shaped_as(self.state_dict(), state, "state")
-        belief, generator = (
-            self.belief.taken_from(state),
-            generator_of(state["generator"], "state.generator", self.device),
-        )
-        self.belief = belief
+        self.belief = self.belief.taken_from(state)
         self._memory = {name: value.clone().to(self.device) for name, value in state["memory"].items()}
-        self.generator.set_state(generator.get_state())
+        self.generator.set_state(state["generator"])

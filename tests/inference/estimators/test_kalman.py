@@ -11,9 +11,7 @@ from torch.autograd.functional import jacobian
 from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, JerkForm, integrate
 from avtorch.inference.estimators import JointEKF, JointUKF
-from avtorch.inference.estimators.jerk_state import JerkState
-from avtorch.inference.estimators.latent_state import LatentState
-from avtorch.inference.estimators.state_model import GaussianState, Observation
+from avtorch.inference.estimators.kalman import GaussianState, JerkState, LatentState, Observation
 from avtorch.inference.latent import FINEST, LatentDensity
 from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.latent_window import LatentWindow

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 from torch.func import grad, vmap
 
-from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.density import SelectableDensity, SubsampledDensity, constrained
 from avtorch.inference.map import Mode
@@ -38,7 +37,8 @@ class ControlVariates:
 
     Example:
         >>> import torch
-        >>> from avtorch.inference import ControlVariates, JerkPoints, find_mode
+        >>> from avtorch.inference import JerkPoints, find_mode
+        >>> from benchmarks.bias.control_variates import ControlVariates
         >>> a, u, noise = torch.randn(3, 1, 500, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
         >>> points = JerkPoints(a, u, (0.9 * u - a) / 0.5 + 0.1 * noise)
         >>> mode = find_mode(points)
@@ -76,23 +76,21 @@ class ControlVariates:
     def points(self) -> int:
         return self.density.points
 
-    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
+    def log_prob(self, z: Tensor) -> Tensor:
         return self.density.log_prob(z)
 
-    def log_prob_minibatch(
-        self, z: Float[Tensor, "*draw window parameter"], index: Int[Tensor, " point"]
-    ) -> Float[Tensor, "*draw window"]:
+    def log_prob_minibatch(self, z: Tensor, index: Tensor) -> Tensor:
         """Unbiased in gradient over minibatches; see the class. ``z``: ``(..., window, parameter)``."""
         linear = ((z - self.mode.z) * self._deviation[:, index].mean(1)).sum(-1)
         return self.density.log_prob_minibatch(z, index) - linear
 
-    def initial(self) -> Float[Tensor, "window parameter"]:
+    def initial(self) -> Tensor:
         return self.density.initial()
 
-    def constrain(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
+    def constrain(self, z: Tensor) -> Tensor:
         return constrained(self.density, z)
 
-    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> ControlVariates:
+    def select(self, index: Tensor) -> ControlVariates:
         """The windows named by ``index``; the gradients at their modes are reused."""
         if not isinstance(self.density, SelectableDensity):
             raise InputError(f"density: the windows of {type(self.density).__name__} cannot be taken apart")
@@ -103,9 +101,7 @@ class ControlVariates:
         return chosen
 
 
-def gradients_by_point(
-    density: SubsampledDensity, z: Float[Tensor, "window parameter"]
-) -> Float[Tensor, "window point parameter"]:
+def gradients_by_point(density: SubsampledDensity, z: Tensor) -> Tensor:
     """Gradient at ``z`` of the estimate that each point alone would give, ``(window, point, parameter)``."""
 
     def estimate(place: Tensor, index: Tensor) -> Tensor:
