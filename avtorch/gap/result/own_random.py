@@ -11,7 +11,11 @@ from avtorch.errors import InputError
 from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.simulator.effect import EFFECTS, Effect
 
-_MADE_OF = {"gust": ("force_sd", "force_time"), "outliers": ("tail_fraction", "tail_scale")}
+_MADE_OF = {
+    "gust": {"force_sd": "sd_mps2", "force_time": "time_constant_s"},
+    "outliers": {"tail_fraction": "fraction", "tail_scale": "scale"},
+}
+"""Parameters of the table's random effects by what they are in `NoiseChange`, the size first."""
 _OF_TABLE = ("gust", "outliers", "command_hold", "road_grade")
 
 
@@ -36,15 +40,14 @@ def own_random(kinds: Sequence[type[Effect]]) -> list[OwnRandom]:
             continue
         typical = kind(**{p.name: float(p.typical()) for p in kind.parameters})
         change = typical.noise(torch.zeros(8, dtype=torch.float64))
-        like = next((k for k, v in _MADE_OF.items() if change is not None and getattr(change, v[0]) is not None), None)
+        like = next((k for k, v in _MADE_OF.items() if change and getattr(change, next(iter(v))) is not None), None)
         if like is None:
             raise InputError(
                 f"{kind.name}: found a random effect whose noise is neither a force nor tails, needs one of the two"
             )
-        theirs = [n for v in EFFECTS[like].noise_parameters.values() for n in (v,)]
         values = {p.name: float(torch.as_tensor(getattr(typical, p.name))) for p in kind.parameters}
         names = {}
-        for field, own in zip(_MADE_OF[like], theirs, strict=True):
+        for field, own in _MADE_OF[like].items():
             given = getattr(change, field)
             same = [n for n, x in values.items() if given is not None and abs(x - float(given)) <= 1e-9 * abs(x)]
             if same:

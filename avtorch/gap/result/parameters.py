@@ -182,19 +182,6 @@ def _within_reach(c: Coordinate, z: float) -> float:
     return value if math.isfinite(value) else math.copysign(_FARTHEST, value)
 
 
-def table_quantities(h: Hypothesis, effect: str, seed: int = 0) -> dict[str, Quantity]:
-    """Parameters of one effect of a fitted hypothesis by the table's names."""
-    draws = sample(h, chains=1, draws=_DRAWS, seed=seed, method="laplace")
-    name = next(e for e in h.effects if base_name(e) == effect)
-    given = effect_values(h, name)
-    for c in EFFECTS[name].coordinates:
-        given[c.parameter] = torch.as_tensor([c.value(x) for x in draws[c.name].reshape(-1).tolist()])
-    kind = EFFECTS[name].kind or TABLE[effect]
-    shown = kind(**{f.name: given[f.name] for f in fields(kind) if f.name in given})
-    lag = torch.as_tensor(draws["T_L"].reshape(-1).copy())
-    return {key: Quantity.of_draws(x) for key, x in shown.report(lag).items()}
-
-
 def road_along(h: Hypothesis, road: RoadGrade) -> RoadGrade:
     """The road with its likeliest profile: the slow force of the residual along the position, a linear regression on
     the road's own splines under the noise of the hypothesis (a Gaussian process; Rasmussen and Williams 2006, 2.7)."""
