@@ -40,8 +40,7 @@ from avtorch.gap.result.hypotheses import (
     verdict,
     verdict_names,
 )
-from avtorch.gap.result.own_random import own_random, renamed
-from avtorch.gap.result.parameters import ParameterPosterior, base_quantities
+from avtorch.gap.result.parameters import ParameterPosterior, base_quantities, own_random, renamed
 from avtorch.gap.result.parts import parts_of, said_of_unnamed
 from avtorch.gap.result.predictive_model import predictive_models
 from avtorch.gap.result.traces import Traces

@@ -82,7 +82,7 @@ class Record:
     def channels(self) -> tuple[str, ...]:
         return tuple(name for name in ("accel", "speed") if getattr(self, name) is not None)
 
-    @cached_property
+    @property
     def starts(self) -> Int[IntArray, " stretch"]:
         """Index of each stretch's first counted row."""
         return np.flatnonzero(np.diff(self.stretch, prepend=-1))

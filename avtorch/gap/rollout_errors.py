@@ -92,12 +92,15 @@ def _window(x: FloatArray, length: int, keeps: float) -> FloatArray:
     return total
 
 
-def rms(channel: str, record: Counted, errors: FloatArray, lag: float) -> float:
-    """Root mean square of a long rollout's `errors` (channel, counted, group) in rollouts of `HORIZON_S`, over all
-    counted rows; `lag` [s]."""
+def rms(record: Counted, errors: FloatArray, lag: float) -> dict[str, float]:
+    """Root mean square by channel of a long rollout's `errors` (channel, counted, group) in rollouts of `HORIZON_S`,
+    over all counted rows; `lag` [s]."""
     edges = [*record.starts.tolist(), record.rows]
     squares = block_squares(record, errors, [slice(a, b) for a, b in pairwise(edges)], lag, HORIZON_S)
-    return float(np.sqrt(squares[f"rollout_rmse_{channel}"].sum() / (record.rows * record.group)))
+    rows = record.rows * record.group
+    return {
+        channel: float(np.sqrt(x.sum() / rows)) for channel, x in zip(record.channels, squares.values(), strict=True)
+    }
 
 
 def reached(record: Counted, horizon: float) -> float:

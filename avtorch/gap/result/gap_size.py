@@ -102,19 +102,16 @@ def gap_size(
     the measurement at every row, and last `HORIZON_S` or as long as the longest stretch: the measures are those of
     `shrinkage`, here over all counted rows. None where the log lacks the channel.
     """
-    one: list[float] = []
-    if rows.accel is not None:
-        one = [_one_step(rows, x.errors[0], x.lag) for x in (none, best)]
-    rollout = {name: [rms(name, rows, x.errors, none.lag) for x in (none, best)] for name in rows.channels}
-    accel, speed = (rollout.get(name, []) for name in ("accel", "speed"))
+    one = [] if rows.accel is None else [_one_step(rows, x.errors[0], x.lag) for x in (none, best)]
+    before, after = (rms(rows, x.errors, none.lag) for x in (none, best))
     return GapSize(
         detected=detected,
         p_value=p_value,
         one_step_rmse=one[0] if one else None,
         one_step_floor=min(one, default=None),
-        rollout_rmse_accel=accel[0] if accel else None,
-        rollout_floor_accel=min(accel, default=None),
-        rollout_rmse_speed=speed[0] if speed else None,
+        rollout_rmse_accel=before.get("accel"),
+        rollout_floor_accel=min(before["accel"], after["accel"]) if "accel" in before else None,
+        rollout_rmse_speed=before.get("speed"),
         horizon_s=reached(rows, HORIZON_S),
         repeats=repeatability(rows),
     )

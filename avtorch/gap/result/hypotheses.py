@@ -19,8 +19,7 @@ from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.outliers import rate_onset
 from avtorch.gap.quantity import Quantity, unit_of
-from avtorch.gap.result.own_random import OwnRandom
-from avtorch.gap.result.parameters import ParameterPosterior
+from avtorch.gap.result.parameters import OwnRandom, ParameterPosterior
 from avtorch.gap.simulator.effect import EFFECTS, Effect, candidate_name, delay_effect
 from avtorch.gap.simulator.effect_response import is_observable
 from avtorch.gap.simulator.parameter import Parameter
