@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, Budget, Part, gap_budget
 from avtorch.gap.engine.coordinates import EFFECTS as TRIED
@@ -18,8 +20,8 @@ from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.recorder import base_fit
+from avtorch.gap.engine.sample import sample
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.parameters import table_quantities
 from avtorch.io import Log
 from benchmarks.blindtest import IN_FRONT, put_in_front
 from benchmarks.blindtest.in_front_score import SIZE_OF, SIZE_WITHIN
@@ -163,7 +165,11 @@ def _beside_the_same(budget: Budget, alone: Hypothesis, effect: str, epoch_s: fl
     for part in budget.parts:
         if part.name in budget.names and part.name in EFFECTS:
             h = with_part(h, part, epoch_s)
-    return table_quantities(fit(h, 12), effect)[SIZE_OF[effect][0]].mean
+    h = fit(h, 12)
+    kept = next(e for e in h.effects if base_name(e) == effect)
+    of = next(c for c in TRIED[kept].coordinates if c.parameter == SIZE_OF[effect][0])
+    draws = sample(h, chains=1, draws=1000, seed=0, method="laplace")[of.name].reshape(-1)
+    return float(np.mean([of.value(x) for x in draws.tolist()]))
 
 
 def with_part(h: Hypothesis, part: Part, epoch_s: float) -> Hypothesis:

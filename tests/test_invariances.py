@@ -25,8 +25,8 @@ import torch
 import avtorch
 from avtorch.follower import diagnose_follower
 from avtorch.gap import DeadTime, plant
-from avtorch.gap.answer.verdict import Candidate
 from avtorch.gap.drive_record import Record
+from avtorch.gap.result.hypotheses import Candidate
 from avtorch.inference import BeliefStream, SamplerSettings
 from avtorch.io import Log, check
 from avtorch.results import estimates_answer

@@ -16,13 +16,14 @@ import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.experiment.manoeuvres import Manoeuvre
+from avtorch.gap.effects import RoadGrade
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.result.predictive_model import PredictiveModel
-from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
 from avtorch.io import Log
 
 _SLOWEST_MPS = 0.5
+_LONG_AGO_S = -1e6
 
 
 def responses(contender: PredictiveModel, manoeuvres: Sequence[Manoeuvre], draws: slice) -> Response:
@@ -33,10 +34,8 @@ def responses(contender: PredictiveModel, manoeuvres: Sequence[Manoeuvre], draws
     belief = {k: torch.as_tensor(x[draws]) for k, x in contender.belief.items()}
     effects = contender.plant.effects
     for effect in effects:  # an effect with an onset in the log acts from the start
-        for name, value in effect.values_after_onset().items():
-            key = f"{effect.name}.{name}"
-            if key in belief or name == effect.own_onset:
-                belief |= {key: torch.full_like(belief["T_L"], value)}
+        if effect.own_onset is not None:
+            belief |= {f"{effect.name}.{effect.own_onset}": torch.full_like(belief["T_L"], _LONG_AGO_S)}
     with torch.inference_mode():
         return contender.plant.response(SimulatorInput(time, command, speed, 0.0, contender.specific_force), belief)
 
@@ -150,7 +149,7 @@ class ManoeuvrePrediction:
         m = self.manoeuvres[number]
         drive = SimulatorInput(torch.as_tensor(m.time), torch.as_tensor(m.command), torch.as_tensor(m.speed))
         assert drive.position is not None
-        own = next(e for e in self.contender.plant.effects if isinstance(e, Integrated))
+        own = next(e for e in self.contender.plant.effects if isinstance(e, RoadGrade))
         road = own.prepared(drive.time, drive.speed, drive.position)
         force = size * road.columns(drive.position).numpy().T
         step = float(m.time[1] - m.time[0])

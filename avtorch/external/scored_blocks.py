@@ -19,10 +19,9 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.gap.blocks import FEWEST_BLOCKS, blocks_of
-from avtorch.gap.drive_record import Record
+from avtorch.gap.drive_record import FEWEST_BLOCKS, Record, blocks_of
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.rollout_errors import HORIZON_S, RolloutMetric, block_squares, reached
+from avtorch.gap.rollout_errors import HORIZON_S, block_squares, reached
 
 _LEAST = 1e-9  # m/s² or m/s: an error, so that simulators without any have a ratio
 
@@ -100,8 +99,7 @@ class ScoredBlocks:
             raise InputError(
                 f"logs: found {len(blocks)} blocks of 4 s of usable driving, needs {FEWEST_BLOCKS} or more"
             )
-        longest = reached(RolloutMetric(record.channels[0], HORIZON_S), record)
-        return cls(record, blocks, HORIZON_S if longest is None else longest)
+        return cls(record, blocks, reached(record, HORIZON_S))
 
     def squares(self, errors: FloatArray, lag: float) -> dict[str, FloatArray]:
         """Squared errors by metric (block,), of a long rollout's `errors` (channel, counted, group); `lag` [s] of its

@@ -25,8 +25,7 @@ from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.gap.answer.change import ChangeCause
 from avtorch.gap.black_box import BlackBoxSimulator
-from avtorch.gap.blocks import FEWEST_BLOCKS, blocks_of
-from avtorch.gap.drive_record import Record
+from avtorch.gap.drive_record import FEWEST_BLOCKS, Record, blocks_of
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.joint import JointModel
 from avtorch.gap.quantity import Quantity
@@ -34,9 +33,8 @@ from avtorch.gap.result.cause_of_change import cause_of_change, dead_time_test
 from avtorch.gap.result.comparison import Change, Comparison, DeadTimeTest, SimulatorChange
 from avtorch.gap.result.diagnosis import LogFacts
 from avtorch.gap.result.lag_and_gain import CAR, LagAndGain
-from avtorch.gap.rollout_errors import HORIZON_S, RolloutMetric, block_squares, reached, rolled_out
-from avtorch.gap.simulator.effect import Effect
-from avtorch.gap.simulator.effect_choice import chosen_effects
+from avtorch.gap.rollout_errors import HORIZON_S, block_squares, reached, rolled_out
+from avtorch.gap.simulator.effect import Effect, chosen_effects
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log, LogSource, as_logs
 from avtorch.io.mapping import Pairs
@@ -181,7 +179,7 @@ def _horizon(sides: Sequence[LagAndGain]) -> float:
     for horizon in _HORIZONS:
         if all(_rows_of(_whole(record, horizon)) > _WHOLE_SHARE * record.rows for record in records):
             return horizon
-    return min(reached(RolloutMetric(r.channels[0], _HORIZONS[-1]), r) or _HORIZONS[-1] for r in records)
+    return min(reached(r, _HORIZONS[-1]) for r in records)
 
 
 def _whole(record: Record, horizon: float) -> list[slice]:

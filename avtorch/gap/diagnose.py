@@ -13,11 +13,7 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.gap.answer.aliases import lookalikes, note
-from avtorch.gap.answer.budget import MATERIAL
-from avtorch.gap.answer.given_dead_time import given_dead_time
-from avtorch.gap.answer.location import RowAttribution, localise
-from avtorch.gap.answer.scope import Scope
+from avtorch.gap.answer.budget import MATERIAL, Budget
 from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.coordinates import EFFECTS, adopt, base_name
@@ -26,9 +22,8 @@ from avtorch.gap.engine.evidence import evaluate_evidence
 from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.inference import RANDOM, Inference, infer
 from avtorch.gap.engine.sample import sample
-from avtorch.gap.quantity import Quantity
 from avtorch.gap.result import sentences
-from avtorch.gap.result.attribution import row_attribution
+from avtorch.gap.result.attribution import RowAttribution, localise, row_attribution
 from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.result.diagnosis import Diagnosis, LogFacts
 from avtorch.gap.result.free_form import fitted_form
@@ -36,19 +31,24 @@ from avtorch.gap.result.free_runs import Blocks
 from avtorch.gap.result.gap_budget import budget_of, shrinkage_of
 from avtorch.gap.result.gap_size import Simulated, gap_size
 from avtorch.gap.result.held_out import held_out_errors, nested
-from avtorch.gap.result.hypotheses import best_weight, candidates_of, first_onset, verdict, verdict_names
-from avtorch.gap.result.own_random import own_random, renamed
-from avtorch.gap.result.parameters import ParameterPosterior, base_quantities
+from avtorch.gap.result.hypotheses import (
+    Scope,
+    best_weight,
+    candidates_of,
+    first_onset,
+    given_dead_time,
+    verdict,
+    verdict_names,
+)
+from avtorch.gap.result.parameters import ParameterPosterior, base_quantities, own_random, renamed
 from avtorch.gap.result.parts import parts_of, said_of_unnamed
 from avtorch.gap.result.predictive_model import predictive_models
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import uncounted
 from avtorch.gap.sensor_noise import with_sensor_noise
-from avtorch.gap.simulator.effect import Effect
-from avtorch.gap.simulator.effect_choice import chosen_effects
-from avtorch.gap.simulator.observability import is_observable
+from avtorch.gap.simulator.effect import Effect, chosen_effects
+from avtorch.gap.simulator.effect_response import is_observable, lookalikes, not_observable
 from avtorch.gap.simulator.plant import GapPlant, plant
-from avtorch.gap.whole_progress import WholeProgress
 from avtorch.io import Log, LogSource, as_logs
 from avtorch.io.mapping import Pairs
 
@@ -189,7 +189,7 @@ def diagnose(
         back = free.form.beside(car)
         ratio = {"T_L": float(back.T_L) / float(car.T_L), "K_L": float(back.K_L) / float(car.K_L)}
         belief = {key: x * ratio.get(key, 1.0) for key, x in belief.items()}
-        moved = {key: Quantity(*(ratio[key] * x for x in (q.mean, q.sd, q.q05, q.q95))) for key, q in moved.items()}
+        moved = {key: q.scaled(ratio[key]) for key, q in moved.items()}
     budget = None
     if held is not None:
         budget = budget_of(
@@ -217,7 +217,7 @@ def diagnose(
         notes[_CARRIES.format(_FORMS[sizes.table > 0, sizes.resistance > 0])] = None
     if told is not None:
         told("held-out blocks", 1, 1)
-    hidden = note(data.channels, kinds)
+    hidden = not_observable(data.channels, kinds)
     alike = lookalikes(said.name, data.channels, specific_force=data.accel_kind == "specific-force", among=kinds)
     said = replace(said, alias_set=tuple(dict.fromkeys([*said.alias_set, *sorted(alike)])))
     attribution = row_attribution(rows, best, none)
@@ -261,6 +261,59 @@ def diagnose(
         parts=parts,
         free_form=None if free is None else free.form,
     )
+
+
+@shows_progress
+def gap_budget(
+    logs: LogSource | Sequence[LogSource],
+    *,
+    baseline: GapPlant | str | PathLike[str] | None = None,
+    effects: Sequence[str | type[Effect]] | None = None,
+    material: float = MATERIAL,
+    seed: int = 0,
+    progress: Callable[[str, int, int], None] | bool | None = None,
+) -> Budget:
+    """The budget of the gap between `baseline` (default: bare GLVD) and the car of these drives: that of `diagnose`.
+
+    Args: as of `diagnose`. Raises `InputError` as it does, and for drives too short to hold out five blocks.
+
+    Example:
+        >>> from avtorch import Leader, simulate
+        >>> from avtorch.gap import ConstantResistance, gap_budget, plant
+        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
+        >>> log = simulate(Leader.default(start=30.0, duration=60.0, dt=0.05), plant=dragging).log()
+        >>> gap_budget(log, effects=["constant_resistance", "dead_time"]).names
+        ('constant_resistance',)
+    """
+    found = diagnose(logs, baseline=baseline, effects=effects, material=material, seed=seed, progress=progress)
+    if found.budget is None:
+        raise InputError(f"{found.log.name}: {found.log.seconds:.0f} s are too short to hold out five blocks of 4 s")
+    return found.budget
+
+
+STEPS = 1000
+"""Steps of a whole diagnosis."""
+
+_SPANS: Mapping[str, tuple[float, float]] = {
+    "recorder": (0.0, 0.1),
+    "outliers": (0.1, 0.15),
+    "effects": (0.15, 0.8),
+    "average": (0.8, 0.9),
+    "held-out blocks": (0.9, 1.0),
+}
+
+
+class WholeProgress:
+    """Takes (what, done, of) of a stage; calls `progress` with the whole's instead, which never goes back."""
+
+    def __init__(self, progress: Callable[[str, int, int], None]) -> None:
+        self._progress = progress
+        self._furthest = 0.0
+
+    def __call__(self, what: str, done: int, of: int) -> None:
+        begin, end = _SPANS.get(what, (0.0, 0.0))
+        self._furthest = max(self._furthest, begin + (end - begin) * done / max(of, 1))
+        self._progress(what, round(STEPS * self._furthest), STEPS)
 
 
 def tried_names(kinds: Sequence[type[Effect]]) -> tuple[str, ...]:

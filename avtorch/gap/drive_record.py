@@ -10,9 +10,11 @@ through them, as if the actuator still followed the command and the ground held 
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -25,13 +27,18 @@ from avtorch.gap.simulator.simulator_input import SimulatorInput
 from avtorch.io import Log
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.engagement import SETTLE_S
-from avtorch.io.log import AccelKind
 from avtorch.io.no_command import no_command
 
 RATE_HZ = 20.0
 """Rows are averaged as long as the resulting rate is at least this [Hz]."""
 _SHORTEST_S = 2.0
 _FAR_M = 1000.0  # several correlation lengths of the road grade: beyond it roads are independent
+
+FEWEST_BLOCKS = 5
+"""On either side of a comparison."""
+_BLOCKS = 20  # of a long drive
+_WHOLE_S = 10.0  # a block holds one to six of these, so that rollouts of this length fit in
+_SHORTER_S = (8.0, 7.0, 6.0, 5.0, 4.0)  # tried in turn where a drive is too short for that
 
 
 class Cut(NamedTuple):
@@ -72,15 +79,10 @@ class Record:
         return len(self.source)
 
     @property
-    def accel_kind(self) -> AccelKind:
-        """The kind of `accel`, as the logs state."""
-        return "specific-force" if self.drives[0].specific_force else "kinematic"
-
-    @property
     def channels(self) -> tuple[str, ...]:
         return tuple(name for name in ("accel", "speed") if getattr(self, name) is not None)
 
-    @cached_property
+    @property
     def starts(self) -> Int[IntArray, " stretch"]:
         """Index of each stretch's first counted row."""
         return np.flatnonzero(np.diff(self.stretch, prepend=-1))
@@ -93,15 +95,7 @@ class Record:
             raise InputError("logs: none given, needs one or more")
         drives: list[SimulatorInput] = []
         cuts: list[Cut] = []
-        columns: dict[str, list[FloatArray]] = {
-            "time": [],
-            "stamp": [],
-            "log": [],
-            "accel": [],
-            "speed": [],
-            "command": [],
-            "use": [],
-        }
+        columns: dict[str, list[FloatArray]] = defaultdict(list)
         names = list(dict.fromkeys(log.name for log in each))
         if len({(log.accel is not None, log.speed is not None) for log in each}) > 1:
             raise InputError(f"logs: {', '.join(names)} have different channels; needs accel, speed or both in all")
@@ -139,14 +133,12 @@ class Record:
                 accel0 = None if log.accel is None else float(mean(log.accel)[:first].mean())
                 raw = log.speed if log.speed is None else log.speed[cut]
                 drives.append(_drive(log.elapsed[cut], log.accel_cmd[cut], raw, accel0, specific, position0))
-                columns["time"].append(time)
-                columns["stamp"].append(log.time[cut][::group])
-                columns["log"].append(np.full(rows, number))
-                columns["command"].append(mean(log.accel_cmd))
-                columns["use"].append((use & settled).astype(float))
-                for name, x in (("accel", log.accel), ("speed", log.speed)):
-                    if x is not None:
-                        columns[name].append(x[cut].reshape(rows, group))
+                of_rows = {"time": time, "stamp": log.time[cut][::group], "log": np.full(rows, number)}
+                of_rows |= {"command": mean(log.accel_cmd), "use": (use & settled).astype(float)}
+                measured = {"accel": log.accel, "speed": log.speed}
+                of_rows |= {name: x[cut].reshape(rows, group) for name, x in measured.items() if x is not None}
+                for name, x in of_rows.items():
+                    columns[name].append(x)
         returns = sum(int((np.diff(log.engaged.astype(int)) == 1).sum()) for log in each)
         if not drives and all(log.engaged.all() for log in each):
             raise InputError(f"{', '.join(names)}: no drive of two seconds or more, nothing to diagnose")
@@ -160,19 +152,16 @@ class Record:
                 f"2 s into each drive{each_return}), needs 10 s or more"
             )
 
-        def whole(name: str) -> FloatArray | None:
-            return np.concatenate(columns[name]) if columns[name] else None
-
-        time, stamp, command = (np.concatenate(columns[name]) for name in ("time", "stamp", "command"))
+        whole = {name: np.concatenate(each) for name, each in columns.items()}
         return cls(
             drives=tuple(drives),
             cuts=tuple(cuts),
-            time=time,
-            stamp=stamp,
-            log=np.concatenate(columns["log"]).astype(np.int64),
-            accel=whole("accel"),
-            speed=whole("speed"),
-            command=command,
+            time=whole["time"],
+            stamp=whole["stamp"],
+            log=whole["log"].astype(np.int64),
+            accel=whole.get("accel"),
+            speed=whole.get("speed"),
+            command=whole["command"],
             dt=dt,
             source=source,
             stretch=stretch,
@@ -254,3 +243,24 @@ def _places(use: list[FloatArray], dt: float) -> tuple[IntArray, IntArray]:
         offset += len(rows)
     empty = np.zeros(0, np.int64)
     return (np.concatenate(source), np.concatenate(stretch)) if source else (empty, empty)
+
+
+def blocks_of(record: Record, *, fewest: int = 0) -> list[slice]:
+    """A partition of the counted rows into blocks of 10 to 60 s; short stretches are blocks of their own.
+
+    Where these are not `fewest`, blocks as short as 4 s.
+    """
+    blocks: list[slice] = []
+    for whole_s in (_WHOLE_S, *_SHORTER_S):
+        blocks = list(_blocks(record, whole_s))
+        if len(blocks) >= fewest:
+            break
+    return blocks
+
+
+def _blocks(record: Record, whole_s: float) -> Iterator[slice]:
+    seconds = whole_s * float(np.clip(round(record.rows * record.dt / _BLOCKS / whole_s), 1, 6))
+    for begin, end in pairwise([*record.starts.tolist(), record.rows]):
+        count = max(1, int((end - begin) * record.dt / seconds + 1e-9))
+        edges = np.linspace(begin, end, count + 1).round().astype(int).tolist()
+        yield from (slice(a, b) for a, b in pairwise(edges))

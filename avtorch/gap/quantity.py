@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from avtorch.display import Frame
 from avtorch.errors import InputError
 
 _NORMAL_Q95 = 1.6448536269514722
-_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(61)
 
 _UNITS = {
     "_mps2": "m/s²",
@@ -56,28 +54,19 @@ class Quantity:
         return cls(float(x.mean()), float(x.std(ddof=1)) if len(x) > 1 else 0.0, float(q05), float(q95))
 
     @classmethod
-    def of_normal(cls, mean: float, sd: float, link: Callable[[Tensor], Tensor] | None = None) -> Quantity:
-        """The quantity `link(z)`, z normal with `mean` and `sd`; `link` is elementwise and monotone (None: z itself).
-
-        Quantiles are exact; mean and SD come from Gauss-Hermite quadrature, accurate to many digits for the links of
-        `Parameter`. `Parameter.constrain` is such a link.
-        """
-        if link is None:
-            return cls(float(mean), float(sd), mean - _NORMAL_Q95 * sd, mean + _NORMAL_Q95 * sd)
-        z = np.concatenate((_NODES, (-_NORMAL_Q95, _NORMAL_Q95)))
-        with torch.no_grad():
-            values = link(torch.as_tensor(mean + sd * z, dtype=torch.float64)).numpy()
-        weights = _WEIGHTS / _WEIGHTS.sum()
-        average = float(weights @ values[:-2])
-        variance = float(weights @ (values[:-2] - average) ** 2)
-        q05, q95 = sorted(map(float, values[-2:]))
-        return cls(average, math.sqrt(variance), q05, q95)
+    def of_normal(cls, mean: float, sd: float) -> Quantity:
+        """The quantity of a normal distribution."""
+        return cls(float(mean), float(sd), mean - _NORMAL_Q95 * sd, mean + _NORMAL_Q95 * sd)
 
     @classmethod
     def of_logarithm(cls, mean: float, variance: float, sure: float) -> Quantity:
         """exp(x) for an x of this `mean` and `variance`; `sure`: half its central 90 % in standard deviations."""
         sd, middle = math.sqrt(variance), math.exp(mean)
         return cls(middle, middle * sd, math.exp(mean - sure * sd), math.exp(mean + sure * sd))
+
+    def scaled(self, by: float) -> Quantity:
+        """`by` > 0 times the quantity."""
+        return Quantity(by * self.mean, by * self.sd, by * self.q05, by * self.q95)
 
     def to_dict(self) -> dict[str, float]:
         """The quantity as JSON: mean, sd, q05, q95."""

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from avtorch.gap import EFFECTS, PLACES, Effect, Response, SimulatorInput, plant
+from avtorch.gap.simulator.effect_response import shown_at
 from avtorch.plots.style import BLACK, BLUE, GREY, VERMILLION, styled
 
 _DT = 0.02
@@ -38,10 +39,8 @@ def standard_response(effect: Effect | None, *, seed: int = _SEED) -> Response:
     An effect that depends on speed gets the speed of this response, found by iteration.
     """
     time, command = standard_command()
-    first = (Effect if effect is None else effect).pictured
-    drive = SimulatorInput(
-        time, command, torch.full_like(time, first), 0.0 if effect is None or effect.place != "body" else None
-    )
+    first = torch.full_like(time, 12.0 if effect is None else shown_at(effect))
+    drive = SimulatorInput(time, command, first, 0.0 if effect is None or effect.place != "body" else None)
     car = plant([] if effect is None else [effect])
     response = car.response(drive, generator=torch.Generator().manual_seed(seed))
     for _ in range(4):

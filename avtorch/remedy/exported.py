@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from avtorch.gap import GapPlant
+from avtorch.gap import Effect, GapPlant
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,12 @@ def not_exported(plant: GapPlant, reported: Collection[str] = ()) -> tuple[str, 
 
 
 SENSOR = "the sensor's, not the car's"
+OVERSHOOT = "its overshoot; the time constant is that of the two poles together"
+
+
+def overshoots(effect: Effect) -> bool:
+    """Whether it makes the actuator one of second order."""
+    return "tau" in effect.actuator_parameters()
 
 
 def delays_of(plant: GapPlant) -> list[str]:

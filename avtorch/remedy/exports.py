@@ -20,7 +20,7 @@ from avtorch.gap import FREE_FORMS, ForceTable, GapPlant, ResistanceCurve
 from avtorch.io import answer_set, atomic
 from avtorch.pedals import PedalMap
 from avtorch.remedy.carla import to_carla
-from avtorch.remedy.exported import Exported, delay_of, delays_of, gain_lost, not_exported
+from avtorch.remedy.exported import OVERSHOOT, Exported, delay_of, delays_of, gain_lost, not_exported, overshoots
 from avtorch.remedy.sumo import to_sumo
 
 ACCELERATION_MAP = "plant.autoware.csv"
@@ -58,8 +58,8 @@ def to_autoware(plant: GapPlant) -> Exported:
         values["vel_rate_lim"] = max(abs(x) for x in bounds)
     limiting = [e.name for e in plant.effects if e.accel_limits() is not None]
     lost = [f"{name}: limits that differ for driving and braking; the tool's one is the wider" for name in limiting]
-    lost += [f"{e.name}: {e.export_loss}" for e in plant.effects if e.export_loss]
-    partly = [*limiting, *delays_of(plant), *(e.name for e in plant.effects if e.export_loss)]
+    lost += [f"{e.name}: {OVERSHOOT}" for e in plant.effects if overshoots(e)]
+    partly = [*limiting, *delays_of(plant), *(e.name for e in plant.effects if overshoots(e))]
     tool = "Autoware planning simulator"
     if acceleration_map(plant) is not None:
         tool += f", vehicle_model_type DELAY_STEER_MAP_ACC_GEARED with acceleration_map_path {ACCELERATION_MAP}"

@@ -12,8 +12,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from avtorch.gap import GapPlant, SimulatorInput
-from avtorch.gap.simulator.integrated import Integrated
+from avtorch.gap import GapPlant, RoadGrade, SimulatorInput
 from avtorch.vehicle.stability import Chain, frequencies
 
 _DT, _SECONDS, _BEFORE = 0.01, 30.0, 1.0
@@ -40,7 +39,7 @@ def linearised(
         ([False], [1.75])
     """
     # the road is not a property of the car
-    own = [e for e in plant.effects if not e.random and not isinstance(e, Integrated)]
+    own = [e for e in plant.effects if not e.random and not isinstance(e, RoadGrade)]
     car = GapPlant(own, T_L=plant.T_L, K_L=plant.K_L, sigma=0.0)
     given = {k: v for k, v in (belief or {}).items() if k in car.parameters()}
     values = {k: torch.as_tensor(v, dtype=torch.float64).reshape(-1) for k, v in {**car.values(), **given}.items()}

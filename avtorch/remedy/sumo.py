@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from xml.etree import ElementTree
 
 from avtorch.gap import GapPlant
-from avtorch.remedy.exported import Exported, delays_of, gain_lost, not_exported
+from avtorch.remedy.exported import OVERSHOOT, Exported, delays_of, gain_lost, not_exported, overshoots
 
 _NO_DELAY = "SUMO has no delay; actionStepLength is the time between two decisions of the driver model"
 _ELSEWHERE = "of Plexe's model CC alone; every other model and TraCI answer at the next step"
@@ -73,6 +73,6 @@ def to_sumo(plant: GapPlant) -> SumoType:
         lost.append(f"decel: {_OWN}")
     lost += gain_lost(plant, "a car does what it is asked to, as far as its limits allow")
     lost += [f"{name}: {_NO_DELAY}" for name in delays_of(plant)]
-    lost += [f"{e.name}: {e.export_loss}" for e in plant.effects if e.export_loss]
-    held = [e.name for e in plant.effects if e.accel_limits() is not None or e.export_loss]
+    lost += [f"{e.name}: {OVERSHOOT}" for e in plant.effects if overshoots(e)]
+    held = [e.name for e in plant.effects if e.accel_limits() is not None or overshoots(e)]
     return SumoType("SUMO vType", values, (*lost, *not_exported(plant, [*held, *delays_of(plant)])))

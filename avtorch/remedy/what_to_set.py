@@ -25,6 +25,7 @@ from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.gap import GapPlant
 from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.simulator.effect_response import is_linear, is_one_sided
 from avtorch.remedy.linearised import linearised
 from avtorch.vehicle.stability import Chain, chain_verdict
 
@@ -172,7 +173,7 @@ def what_to_set(
     at = {"assumed": _quantiles(thought_at[0]), "in_force": now_at, "then": then_at}
     sufficient = p_best >= required
     strategies = tuple(sorted(chosen.strategies(now)[0]))
-    names = [e.name for e in plant.effects if not e.linear]
+    names = [e.name for e in plant.effects if not is_linear(e)]
     notes = (f"{' and '.join(names)}: evaluated for steps of {STEP_MPS2:g} m/s².",) if names else ()
     return WhatToSet(
         in_force=now,
@@ -219,7 +220,7 @@ def setting_for(
 
 def _chains(plant: GapPlant, draws: Mapping[str, Tensor], speeds: Sequence[float]) -> list[Chain]:
     """Chains at every speed; driving and braking separately where the plant responds differently to them."""
-    bends = any(e.one_sided for e in plant.effects)
+    bends = any(is_one_sided(e) for e in plant.effects)
     at = speeds if any(e.needs_speed for e in plant.effects) else speeds[:1]
     steps = (STEP_MPS2, -STEP_MPS2) if bends else (STEP_MPS2,)
     return [linearised(plant, draws, speed=v, step=u) for v in at for u in steps]

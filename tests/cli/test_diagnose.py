@@ -20,8 +20,9 @@ from avtorch.cli import main
 from avtorch.cli.diagnosis_table import bar, diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, DeadTime, GapPlant, plant
-from avtorch.gap.result.diagnosis import Candidate, Diagnosis, GapSize, LogFacts, Quantity, near, verdict_of
+from avtorch.gap.result.diagnosis import Candidate, Diagnosis, GapSize, LogFacts, Quantity
 from avtorch.io import Log, read_answer
+from tests.gap.verdicts import near, verdict_of
 
 ROWS = 600
 

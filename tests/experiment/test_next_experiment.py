@@ -14,17 +14,17 @@ from avtorch.errors import InputError
 from avtorch.experiment import Limits, ManoeuvrePrediction, information, library, next_experiment, write_table
 from avtorch.experiment.prediction import responses
 from avtorch.gap import Effect, plant
-from avtorch.gap.answer.verdict import Candidate, verdict_of
 from avtorch.gap.effects import AerodynamicDrag, ConstantResistance, DeadBand, GainChange, RoadGrade, SensorBias
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance
 from avtorch.gap.result.diagnosis import Diagnosis, GapSize, LogFacts
-from avtorch.gap.result.noise_spectrum import NoiseSpectrum
-from avtorch.gap.result.predictive_model import PredictiveModel
+from avtorch.gap.result.hypotheses import Candidate
+from avtorch.gap.result.predictive_model import NoiseSpectrum, PredictiveModel
 from avtorch.gap.result.sentences import to_drive
 from tests.bars import BAR
 from tests.gap.records import log_of
+from tests.gap.verdicts import verdict_of
 
 BOTH = ("accel", "speed")
 

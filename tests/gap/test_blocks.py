@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avtorch.gap.blocks import FEWEST_BLOCKS, blocks_of
-from avtorch.gap.drive_record import Record
+from avtorch.gap.drive_record import FEWEST_BLOCKS, Record, blocks_of
 from tests.gap.records import log_of
 
 

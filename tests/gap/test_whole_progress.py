@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from avtorch import GLVDPlant, Leader, diagnose, simulate
-from avtorch.gap.whole_progress import STEPS, WholeProgress
+from avtorch.gap.diagnose import STEPS, WholeProgress
 
 
 def _told(*steps: tuple[str, int, int]) -> list[int]:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from avtorch.gap.answer.location import Location
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.simulator.cause_words import named_cause
-from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.effect import named_cause
 
 HORIZON_S = 10.0
 """Of the rollouts whose errors a budget divides [s]."""
@@ -59,15 +58,6 @@ class Part:
             "onset_s": self.onset_s,
             "plausible": self.plausible,
         }
-
-
-def own_onset(kind: type[Effect], parameters: Mapping[str, Quantity], epoch_s: float | None) -> float | None:
-    """Since when [s] an effect acts that has the time among its `parameters`; None of others, or of several logs.
-
-    `epoch_s`: the log's start on its own clock; None: several logs.
-    """
-    own = parameters.get(kind.own_onset or "")
-    return None if own is None or epoch_s is None else epoch_s + own.mean
 
 
 @dataclass(frozen=True)
@@ -170,7 +160,7 @@ class ChannelError:
     left: float
 
     def to_dict(self) -> dict[str, float]:
-        return {"before": self.before, "floor": self.floor, "left": self.left}
+        return asdict(self)
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect import Effect, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 _FAST = 30.0
@@ -41,9 +40,6 @@ class AerodynamicDrag(Effect):
     needs_speed = True
     meaning = "air resistance that the lower level does not compensate"
     equation = "-c (v + w)²"
-    force_sign = -1
-    pictured = 25.0
-    starts = fixed(drag_per_m=(5e-5, 4e-4))
     parameters = (
         Parameter(
             "drag_per_m", "1/m", 0.0, 2e-4, 6e-4, possible=(0.0, 3e-3), beyond="no car has that much air resistance"

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect import Effect, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -39,11 +38,8 @@ class Backlash(Effect):
     name = "backlash"
     place = "command"
     order = 3
-    memory = True
     meaning = "a play is crossed whenever the command turns back"
     equation = "y = max(u - beta, min(u + beta, y of the row before))"
-    linear = False
-    starts = fixed(half_width_mps2=(0.03, 0.07, 0.13, 0.22, 0.35))
     parameters = (
         Parameter(
             "half_width_mps2", "m/s²", 0.0, 0.02, 0.3, possible=(0.0, 1.0), beyond="no driveline has that much play"

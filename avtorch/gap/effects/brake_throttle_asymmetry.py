@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect import Effect, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 _ALIKE = 0.05
@@ -41,8 +40,6 @@ class BrakeThrottleAsymmetry(Effect):
     place = "actuator"
     meaning = "gain and lag differ between braking and driving"
     equation = "K_L, T_L times ratios where u < 0"
-    one_sided = True
-    starts = fixed(brake_gain_ratio=(0.6, 0.95, 1.2), brake_lag_ratio=(1.0, 2.5))
     parameters = (
         Parameter(
             "brake_gain_ratio", "-", 1.0, 0.5, 0.9, possible=(0.2, 5.0), beyond="brakes and engine differ by less"

@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, NoiseChange, fixed, register
+from avtorch.gap.simulator.effect import Effect, NoiseChange, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 _ROWS_BACK = 12  # older commands have a weight of 0.5^12 at most, at a loss fraction of 0.5
@@ -40,11 +39,8 @@ class CommandHold(Effect):
 
     name = "command_hold"
     place = "command"
-    memory = True
-    random = True
     meaning = "messages are lost and the last command is held"
     equation = "u of the last row that arrived"
-    noise_parameters = fixed(loss="hold_fraction")
     parameters = (
         Parameter(
             "hold_fraction", "-", 0.0, 0.02, 0.2, "unit", possible=(0.0, 0.6), beyond="no link loses so many messages"

@@ -8,14 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect import Effect, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
-from avtorch.io.units import GRAVITY
 from avtorch.vehicle.arguments import Number, tensor
-
-_MEAN_SLOPE = 0.06
-"""Of a road that climbs all the way: as much as such a resistance, and steeper than roads are for long."""
 
 
 @register
@@ -40,11 +35,6 @@ class ConstantResistance(Effect):
     place = "body"
     meaning = "the same deceleration at every speed"
     equation = "-r while moving"
-    alias = "offset"
-    force_sign = -1
-    slow_force = True
-    commutes = True
-    starts = fixed(resistance_mps2=(0.02, 0.15))
     parameters = (
         Parameter(
             "resistance_mps2",
@@ -61,16 +51,8 @@ class ConstantResistance(Effect):
     def in_words(cls, values: Mapping[str, float]) -> str:
         return f"the car is slowed by {values['resistance_mps2']:.2g} m/s² at every speed"
 
-    @classmethod
-    def alike(cls, values: Mapping[str, float]) -> tuple[str, ...]:
-        return ("road_grade",) if values["resistance_mps2"] <= _MEAN_SLOPE * GRAVITY else ()
-
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         force = -tensor(self.resistance_mps2)
         if row.measured_speed is None:
             return force * torch.ones_like(x)
         return torch.where(row.speed > 0, force, 0.0)
-
-    @classmethod
-    def constant_accel(cls, values: Mapping[str, float] | None) -> float:
-        return -1.0 if values is None else -values["resistance_mps2"]

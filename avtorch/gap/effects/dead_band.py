@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect import Effect, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -37,8 +36,6 @@ class DeadBand(Effect):
     order = 2
     meaning = "commands within a band do nothing, larger ones are reduced by its half width"
     equation = "sign(u) max(|u| - delta, 0)"
-    linear = False
-    starts = fixed(half_width_mps2=(0.03, 0.07, 0.13, 0.22, 0.35))
     parameters = (
         Parameter("half_width_mps2", "m/s²", 0.0, 0.02, 0.3, possible=(0.0, 1.0), beyond="no pedal ignores that much"),
     )

@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect import Effect, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -41,12 +40,9 @@ class DeadTime(Effect):
     name = "dead_time"
     place = "command"
     order = 9
-    memory = True
     shift = "delay_s"
     meaning = "the command acts after a delay"
     equation = "u(t - tau)"
-    role = "delay"
-    starts = fixed(delay_s=(0.03, 0.07, 0.13, 0.22, 0.35, 0.55))
     parameters = (Parameter("delay_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.5), beyond="no command is that late"),)
 
     @classmethod

@@ -7,14 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.actuator import modes_over
-from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect import Effect, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.recursion import scan_pair
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -49,14 +47,8 @@ class DrivelineOscillation(Effect):
 
     name = "driveline_oscillation"
     place = "body"
-    memory = True
     meaning = "changes of the drive torque make the driveline ring"
     equation = "amplitude y,  y'' + 2 zeta omega y' + omega² y = omega da/dt"
-    starts = fixed(
-        frequency_hz=tuple(np.geomspace(0.9, 5.5, 14)),
-        amplitude=(0.1,),
-        quadrature=(0.05,),
-    )
     parameters = (
         Parameter("frequency_hz", "Hz", None, 1.0, 5.0, possible=(0.3, 15.0), beyond="no driveline has such a mode"),
         Parameter(

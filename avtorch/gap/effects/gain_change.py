@@ -11,10 +11,7 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect, fixed, register
-from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.effect import Domain, Effect, EffectContext, Parameter, register
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -50,8 +47,6 @@ class GainChange(Effect):
     equation = "K_L (1 + (ratio - 1) clip((t - t_change) / ramp, 0, 1))"
     own_onset = "change_s"
     of_the_drive = True
-    commutes = True
-    starts = fixed(ramp_s=(0.3, 3.0, 30.0))
     parameters = (
         Parameter("gain_ratio", "-", 1.0, 0.65, 1.4, possible=(0.2, 5.0), beyond="payload and brake fade do less"),
         Parameter("change_s", "s", None, 0.0, 60.0, "interval", possible=(-math.inf, math.inf)),
@@ -80,9 +75,6 @@ class GainChange(Effect):
         since = row.time - tensor(self.change_s)
         share = (_area(since + row.dt, ramp) - _area(since, ramp)) / row.dt
         return 1 + (tensor(self.gain_ratio) - 1) * share, 1.0
-
-    def values_after_onset(self) -> Mapping[str, float]:
-        return {"change_s": -1e3, "ramp_s": 0.0}
 
     def coordinates(self) -> tuple[Parameter, ...]:
         ratio, change, ramp = self.parameters

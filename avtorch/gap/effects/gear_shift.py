@@ -11,10 +11,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect, fixed, register
-from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.effect import Domain, Effect, EffectContext, Parameter, register
 from avtorch.vehicle.arguments import Number, tensor
 
 _NEVER = -1e9
@@ -52,17 +49,10 @@ class GearShift(Effect):
 
     name = "gear_shift"
     place = "actuator"
-    memory = True
     needs_speed = True
     meaning = "upshifts at certain speeds interrupt the drive torque"
     equation = "K_L (1 - depth) for duration after each upshift, where u > 0"
     of_the_drive = True
-    starts = fixed(
-        depth=(0.5,),
-        duration_s=(0.25,),
-        first_mps=tuple(np.arange(3.2, 6.9, 0.2)),
-        gear_ratio=tuple(np.arange(1.35, 1.77, 0.035)),
-    )
     parameters = (
         Parameter("depth", "-", 0.0, 0.3, 0.95, "unit"),
         Parameter("duration_s", "s", None, 0.1, 0.6, possible=(0.02, 2.5), beyond="no gear shift has that duration"),

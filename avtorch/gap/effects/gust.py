@@ -9,9 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, NoiseChange, fixed, register
+from avtorch.gap.simulator.effect import Effect, NoiseChange, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.recursion import scan
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -41,12 +40,8 @@ class Gust(Effect):
 
     name = "gust"
     place = "body"
-    memory = True
-    random = True
     meaning = "wind and road push the car at random, for seconds"
     equation = "df = -f / tau dt + sd sqrt(2 / tau) dW"
-    slow_force = True
-    noise_parameters = fixed(force_sd="sd_mps2", force_time="time_constant_s")
     parameters = (
         Parameter("sd_mps2", "m/s²", 0.0, 0.1, 0.4, possible=(0.0, 0.6), beyond="wind and road do not do this"),
         Parameter(

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect import Effect, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 _FADES_AT = 3.0  # [m/s]
@@ -41,9 +40,6 @@ class LowSpeedCreep(Effect):
     needs_speed = True
     meaning = "the car is pushed forward at walking speed"
     equation = "creep / (1 + exp((v - 3) / 0.5))"
-    force_sign = 1
-    pictured = 1.0
-    starts = fixed(creep_mps2=(0.05, 0.3))
     parameters = (
         Parameter("creep_mps2", "m/s²", 0.0, 0.1, 0.5, possible=(0.0, 1.5), beyond="no car creeps that strongly"),
     )

@@ -9,10 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect, NoiseChange, fixed, register
-from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.effect import Domain, Effect, EffectContext, NoiseChange, Parameter, register
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -45,11 +42,8 @@ class Outliers(Effect):
     name = "outliers"
     place = "sensor"
     order = 9
-    random = True
     meaning = "single samples of the accelerometer are far off"
     equation = "a + scale sigma e, with probability fraction"
-    commutes = True
-    noise_parameters = fixed(tail_fraction="fraction", tail_scale="scale")
     parameters = (
         Parameter(
             "fraction", "-", 0.0, 0.005, 0.05, "unit", possible=(0.0, 0.3), beyond="outliers are not that frequent"

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect import Effect, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -39,8 +38,6 @@ class RateLimit(Effect):
     order = 2
     meaning = "the actuator's jerk is bounded"
     equation = "da/dt = (K u - a) / T_L within ± jerk_max"
-    linear = False
-    starts = fixed(jerk_max_mps3=(0.4, 0.7, 1.1, 1.8, 3.0, 5.0))
     parameters = (
         Parameter(
             "jerk_max_mps3",

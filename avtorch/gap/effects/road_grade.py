@@ -12,20 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import register
-from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.integrated import Integrated
-from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.effect import Domain, Effect, EffectContext, Parameter, register
+from avtorch.io.units import GRAVITY
 from avtorch.vehicle.arguments import Number, tensor
-
-GRAVITY = 9.80665
-"""[m/s²]"""
 
 
 @register
 @dataclass(frozen=True)
-class RoadGrade(Integrated):
+class RoadGrade(Effect):
     """`-g sin(slope(position))`; the grade is a Gaussian process over position of RMS `grade_rms`; neutral at 0.
 
     Its correlation (Matern 3/2) has the length `smooth_m` [m]. It is expanded in cubic B-splines, one every `knot_m`
@@ -59,7 +53,6 @@ class RoadGrade(Integrated):
     meaning = "a road grade that the log does not record"
     equation = "-g sin(slope(x)), slope a smooth random function of position"
     of_the_drive = True
-    size = "grade_rms"
     parameters = (Parameter("grade_rms", "-", 0.0, 0.02, 0.06, possible=(0.0, 0.2), beyond="no road is that steep"),)
     settings = (
         Domain("profile", -100.0, 100.0, least=4, most=4096),
@@ -91,10 +84,6 @@ class RoadGrade(Integrated):
         if self.profile is not None:
             return self
         return replace(self, profile=torch.randn(self.knots, generator=generator, dtype=torch.float64))
-
-    @property
-    def count(self) -> int:
-        return self.knots
 
     def columns(self, position: Tensor) -> Tensor:
         """Acceleration (time, knot) per unit of each coefficient at `grade_rms` 1, `position` (time,) [m]."""

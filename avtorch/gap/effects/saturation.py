@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect import Effect, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -39,12 +38,6 @@ class Saturation(Effect):
     order = 1
     meaning = "commands beyond what drive or brakes can deliver are clipped"
     equation = "K u within [a_min, a_max]"
-    linear = False
-    one_sided = True
-    starts = fixed(
-        accel_max_mps2=(0.5, 0.75, 1.0, 1.25, 1.6, 2.1, 5.0),
-        accel_min_mps2=(-0.8, -1.2, -1.6, -2.1, -2.8, -8.0),
-    )
     parameters = (
         Parameter(
             "accel_max_mps2", "m/s²", float("inf"), 0.8, 2.0, possible=(0.1, 12.0), beyond="no engine saturates there"

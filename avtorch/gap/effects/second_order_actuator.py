@@ -10,14 +10,8 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect, fixed, register
-from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.effect import Domain, Effect, EffectContext, Parameter, register
 from avtorch.vehicle.arguments import Number, tensor
-
-_DAMPED = 0.85  # damping ratio limit: a fit has an error of about 0.1
-
 
 _NO_OVERSHOOT = 0.8
 """Damping from which a step overshoots by less than 2 %."""
@@ -54,9 +48,6 @@ class SecondOrderActuator(Effect):
     order = 1
     meaning = "the actuator has inertia and may overshoot"
     equation = "a'' = omega² (K u - a) - 2 zeta omega a'"
-    alias = "pole"
-    export_loss = "its overshoot; the time constant is that of the two poles together"
-    starts = fixed(inverse_frequency_s=(0.05, 0.15, 0.4))
     parameters = (
         Parameter("inverse_frequency_s", "s", 0.0, 1 / 12, 1 / 3, reported=False),
         Parameter("lag_ratio", "-", 1.0, 0.65, 1 / 0.65, reported=False, of_onset=True),
@@ -79,12 +70,6 @@ class SecondOrderActuator(Effect):
 
     def actuator_parameters(self) -> Mapping[str, Tensor]:
         return {"tau": tensor(self.inverse_frequency_s)}
-
-    @classmethod
-    def aliased(cls, values: Mapping[str, float]) -> bool:
-        """Whether the two poles are real, as those of two first-order lags are: a damping ratio of 1 or more."""
-        damping = values["T_L"] / max(2 * values["inverse_frequency_s"], 1e-9)
-        return damping >= _DAMPED
 
     def report(self, T_L: Tensor) -> dict[str, Tensor]:
         tau = tensor(self.inverse_frequency_s)

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect import Effect, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -36,10 +35,6 @@ class SensorBias(Effect):
     order = 2
     meaning = "the accelerometer has a constant offset"
     equation = "a + b"
-    alias = "offset"
-    slow_force = True
-    commutes = True
-    starts = fixed(bias_mps2=(0.02, -0.02))
     parameters = (
         Parameter(
             "bias_mps2",
@@ -60,7 +55,3 @@ class SensorBias(Effect):
 
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         return x + tensor(self.bias_mps2)
-
-    @classmethod
-    def constant_accel(cls, values: Mapping[str, float] | None) -> float | None:
-        return None if values is None else values["bias_mps2"]

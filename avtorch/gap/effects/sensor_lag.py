@@ -9,9 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect import Effect, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.recursion import scan
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -39,11 +38,8 @@ class SensorLag(Effect):
 
     name = "sensor_lag"
     place = "sensor"
-    memory = True
     meaning = "the accelerometer lags the car's acceleration"
     equation = "s' = (a - s) / lag"
-    alias = "pole"
-    starts = fixed(lag_s=(0.03, 0.1, 0.2, 0.4))
     parameters = (
         Parameter(
             *("lag_s", "s", 0.0, 0.05, 0.5),

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect import Effect, Parameter, register
 from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -36,8 +35,6 @@ class SensorScale(Effect):
     order = 1
     meaning = "the accelerometer's gain is wrong"
     equation = "scale a"
-    alias = "K_L"
-    starts = fixed(scale=(0.95, 1.05))
     parameters = (
         Parameter("scale", "-", 1.0, 0.83, 1.2, possible=(0.5, 2.0), beyond="no accelerometer has that scale error"),
     )

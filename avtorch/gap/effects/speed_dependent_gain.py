@@ -8,10 +8,7 @@ from typing import Self
 
 from torch import Tensor
 
-from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect, fixed, register
-from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.effect import Domain, Effect, EffectContext, Parameter, register
 from avtorch.vehicle.arguments import Number, tensor
 
 _LEAST = 0.0  # the factor's lower limit, outside a drive's range of speeds
@@ -47,7 +44,6 @@ class SpeedDependentGain(Effect):
     needs_speed = True
     meaning = "the realised share of the command depends on speed"
     equation = "K_L (1 + slope (v - v_mean) / v_mean)"
-    starts = fixed(gain_slope=(-0.15, 0.15))
     parameters = (
         Parameter(
             "gain_slope", "-", 0.0, -0.4, 0.4, "real", possible=(-2.0, 2.0), beyond="no gain depends that much on speed"

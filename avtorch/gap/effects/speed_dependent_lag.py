@@ -8,10 +8,7 @@ from typing import Self
 
 from torch import Tensor
 
-from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect, fixed, register
-from avtorch.gap.simulator.effect_context import EffectContext
-from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.effect import Domain, Effect, EffectContext, Parameter, register
 from avtorch.vehicle.arguments import Number, tensor
 
 _LEAST = 0.05  # the factor's lower limit, outside a drive's range of speeds
@@ -47,7 +44,6 @@ class SpeedDependentLag(Effect):
     needs_speed = True
     meaning = "the actuator is slower at some speeds"
     equation = "T_L (1 + slope (v - v_mean) / v_mean)"
-    starts = fixed(lag_slope=(-0.4, 0.4))
     parameters = (
         Parameter("lag_slope", "-", 0.0, -0.7, 0.7, "real", possible=(-2.0, 2.0), beyond="no lag varies that much"),
         Parameter("pivot", "-", None, 0.6, 1 / 0.6, reported=False, of_onset=True),

@@ -343,8 +343,9 @@ def adopt(kind: type[Effect]) -> EngineEffect:
     starts = [tuple(typical)]
     if coordinates and coordinates[0].signed:
         starts.append((-typical[0], *typical[1:]))
-    given = kind.starts.get(coordinates[0].parameter, ()) if coordinates else ()
-    starts += [(coordinates[0].coordinate(x), *typical[1:]) for x in given]
+    if coordinates:  # a bound that is never reached has no slope: from either end of its range, too
+        ends = next((p.low, p.high) for p in kind.parameters if p.name == coordinates[0].parameter)
+        starts += [(coordinates[0].coordinate(x), *typical[1:]) for x in ends]
     needs = _SPEED if kind.needs_speed else frozenset[str]()
     if kind.place == "sensor":
         needs = _BOTH

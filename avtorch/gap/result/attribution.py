@@ -1,22 +1,61 @@
-"""What a hypothesis changes, row by row, in nats: the transform is orthonormal, so that nats of coefficients are nats
-of rows.
+"""What a hypothesis changes, row by row, in nats, and where that lies.
 
 In units of the noise, half the square of the change that a hypothesis makes to the prediction is what it is expected to
-gain; the difference of the squared residuals is what it did gain. Both are spread over rows by the transform's adjoint.
+gain; the difference of the squared residuals is what it did gain. Both are spread over rows by the transform's adjoint,
+which is orthonormal: nats of coefficients are nats of rows.
+
+On each axis the part named is the shortest stretch that holds nearly all of what is expected, if clearly fewer rows lie
+there. Each part is tested by the gain of its rows less the whole cost of the model. This is an e-value, for which the
+procedure of Wang and Ramdas (2022) controls the false-discovery rate under any dependence between parts.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
 import numpy as np
+from scipy.signal import lfilter
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.answer.location import RowAttribution
+from avtorch.gap.answer.location import Axis, Location
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import EFFECT_NATS
 from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
+
+_MOST = 0.95  # share of the cause's effect that a part holds
+_BAND = 0.9  # share of the power
+
+PLAINLY = 0.6
+"""Largest share of the rows since the onset that a part may cover."""
+RATE = 0.05
+"""False-discovery rate."""
+
+
+@dataclass(frozen=True, eq=False)
+class RowAttribution:
+    """Gain and effect of a model fitted to all drives, for every counted row (counted,).
+
+    `gained` [nats]: gain in log density over the bare baseline. `paid` [nats], for all rows together: the cost of the
+    fitted parameters and of the selection. `does` [nats]: expected gain, half the square of the whitened change in the
+    rollout; `felt` [nats]: the same for the accelerometer's faults alone. `moved` (channel, counted): the change
+    itself.
+    """
+
+    record: CountedRows
+    gained: FloatArray = field(repr=False)
+    paid: float
+    does: FloatArray = field(repr=False)
+    felt: FloatArray = field(repr=False)
+    moved: FloatArray = field(repr=False)
+
+    @property
+    def p_value(self) -> float:
+        """Upper bound on the p-value of the bare baseline against the model: the inverse of the e-value."""
+        return float(np.exp(-np.clip(self.gained.sum() - self.paid, 0.0, 700.0)))
 
 
 def row_attribution(rows: CountedRows, h: Hypothesis, base: Hypothesis) -> RowAttribution:
@@ -51,3 +90,122 @@ def _without_sensor(h: Hypothesis) -> FloatArray | None:
         for c in EFFECTS[e].coordinates:
             values[INDEX[c.name]] = h.neutral[INDEX[c.name]]
     return h.response(values)
+
+
+def localise(attribution: RowAttribution, *, onset_s: float | None, lag: float) -> tuple[Location, ...]:
+    """The significant parts, most significant first. `onset_s`: from the log's start; `lag` [s] of the actuator."""
+    parts: list[Part] = [*_stretches(attribution, onset_s, lag), *_signals(attribution), *_band(attribution)]
+    q_values = _q_values([gain - attribution.paid for *_, gain in parts])
+    parts = [(axis, *_stamps(attribution, axis, a, b), share, gain) for axis, a, b, share, gain in parts]
+    named = [Location(axis, a, b, share, q) for (axis, a, b, share, _), q in zip(parts, q_values, strict=True)]
+    return tuple(sorted((w for w in named if w.q_value <= RATE), key=lambda w: w.q_value))
+
+
+def _stamps(
+    attribution: RowAttribution, axis: Axis, begin: float | str, end: float | str
+) -> tuple[float | str, float | str]:
+    """Both ends, with times converted from the log's start to the log's own clock."""
+    if axis != "time" or isinstance(begin, str) or isinstance(end, str):
+        return begin, end
+    record = attribution.record
+    time, stamp = record.time[record.source], record.stamp[record.source]
+    first, last = (int(np.abs(time - t).argmin()) for t in (begin, end))
+    return begin + float(stamp[first] - time[first]), end + float(stamp[last] - time[last])
+
+
+Part = tuple[Axis, float | str, float | str, float, float]
+"""Axis, ends, share of the cause's contribution, and gain within the part [nats]."""
+
+
+def _stretches(attribution: RowAttribution, onset_s: float | None, lag: float) -> Iterator[Part]:
+    record, does = attribution.record, attribution.does
+    time = record.time[record.source]
+    one_clock = bool((np.diff(time) > 0).all()) and len(np.unique(record.log)) == 1
+    if onset_s is not None and one_clock:
+        # random effects (glitches, lost messages) have an onset but no predictable contribution
+        since_then = does if does.any() else np.ones(len(time))
+        yield _part(attribution, "time", time, onset_s, float(time[-1]), since_then)
+    if not does.any():
+        return
+    axes: list[tuple[Axis, FloatArray]] = [("time", time)] if onset_s is None and one_clock else []
+    if record.speed is not None:
+        axes.append(("speed", record.speed.mean(-1)[record.source]))
+    # the command filtered by the lag: an effect of the command is visible once the actuator has followed
+    share = -np.expm1(-record.dt / lag)
+    command = np.asarray(lfilter([share], [1, share - 1], record.command))[record.source]
+    axes.append(("command", command))
+    since = time >= onset_s if onset_s is not None and one_clock else np.ones(len(time), bool)
+    for axis, x in axes:
+        # weighted by size, not by square, or the edges of the active region would be lost
+        low, high = shortest(x, np.sqrt(does), _MOST)
+        if ((x >= low) & (x <= high))[since].mean() <= PLAINLY:
+            part = _part(attribution, axis, x, low, high, does)
+            yield part if axis != "command" else (axis, *_own_ends(x, low, high, record.command), *part[3:])
+
+
+def _own_ends(x: FloatArray, low: float, high: float, command: FloatArray) -> tuple[float, float]:
+    """`low` and `high` of a filtered command `x`; an end at the range's limit becomes that of the raw `command`."""
+    return (
+        float(command.min()) if low <= x.min() + 1e-9 else low,
+        float(command.max()) if high >= x.max() - 1e-9 else high,
+    )
+
+
+def _part(attribution: RowAttribution, axis: Axis, x: FloatArray, low: float, high: float, does: FloatArray) -> Part:
+    inside = (x >= low) & (x <= high)
+    return axis, low, high, float(does[inside].sum() / does.sum()), float(attribution.gained[inside].sum())
+
+
+def shortest(x: FloatArray, weight: FloatArray, share: float) -> tuple[float, float]:
+    """Ends of the shortest interval of `x` (row,) that holds `share` of the `weight` (row,)."""
+    order = np.argsort(x)
+    x, total = x[order], np.concatenate([[0.0], np.cumsum(weight[order])])
+    ends = np.searchsorted(total, total[:-1] + share * total[-1] * (1 - 1e-12))
+    fits = np.flatnonzero(ends <= len(x))
+    lengths = x[ends[fits] - 1] - x[fits]
+    best = fits[int(lengths.argmin())]
+    return float(x[best]), float(x[ends[best] - 1])
+
+
+def _signals(attribution: RowAttribution) -> Iterator[Part]:
+    does, felt = float(attribution.does.sum()), float(attribution.felt.sum())
+    if does <= 0:
+        return
+    gained = float(attribution.gained.sum())
+    sensing = min(felt / does, 1.0)
+    for name, share in (("actuation", 1 - sensing), ("sensing", sensing)):
+        if share > 0:
+            yield "signal", name, name, share, share * gained
+
+
+def _band(attribution: RowAttribution) -> Iterator[Part]:
+    """The frequency band of the cause's change of acceleration."""
+    record = attribution.record
+    accel = attribution.moved[0] if "accel" in record.channels else np.gradient(attribution.moved[-1]) / record.dt
+    power, f = np.zeros(0), np.zeros(0)
+    for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
+        x = accel[first:last]
+        power = np.concatenate([power, np.abs(np.fft.rfft(x * np.hanning(len(x))))[1:] ** 2])
+        f = np.concatenate([f, np.fft.rfftfreq(len(x), record.dt)[1:]])
+    if not power.sum() > 0:
+        return
+    low, high = shortest(np.log(f), power, _BAND)
+    if high - low <= 0.75 * np.ptp(np.log(f)):
+        share = float(power[(np.log(f) >= low) & (np.log(f) <= high)].sum() / power.sum())
+        # the lowest frequency that a drive resolves includes the steady part
+        slowest = low <= np.log(f.min()) + 1e-9
+        begin, end = 0.0 if slowest else float(np.exp(low)), float(np.exp(high))
+        yield "frequency", begin, end, share, share * float(attribution.gained.sum())
+
+
+def _q_values(gains: Sequence[float]) -> list[float]:
+    """q-values from e-values, given by their logarithms."""
+    if not gains:
+        return []
+    order = np.argsort(-np.asarray(gains))
+    rank = np.arange(1, len(gains) + 1)
+    q = np.minimum(1.0, len(gains) / rank * np.exp(-np.clip(np.asarray(gains)[order], -50.0, 700.0)))
+    q = np.minimum.accumulate(q[::-1])[::-1]
+    out = np.empty(len(gains))
+    out[order] = q
+    return out.tolist()

@@ -27,7 +27,6 @@ from avtorch.gap.engine.joint import Change, JointFit, JointModel, of_car
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import DeadTimeTest
 from avtorch.gap.simulator.effect import Effect
-from avtorch.gap.simulator.integrated import Integrated
 
 _ERRORS = 4.0  # 2.6 standard errors are as likely as not, and 1.4 more have them in nine of ten drives
 _EXCITED = 0.5
@@ -45,7 +44,7 @@ def cause_of_change(
     Random effects, and those of one drive alone (a grade, a moment), are left out. `progress(what, done, of)` is called
     at each hypothesis.
     """
-    names = [adopt(k).name for k in kinds if not (k.random or k.of_the_drive or issubclass(k, Integrated))]
+    names = [adopt(k).name for k in kinds if not (k.random or k.of_the_drive)]
     found = search_changes(model, candidates(model, names), progress)
     parts = tuple(_part(found, change) for change in found.best.fit.changes)
     parts = tuple(part for part in parts if part.probability >= LIKELY or len(part.alias_set) > 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from avtorch.display import Card, Displayed, Frame
@@ -29,7 +29,7 @@ class Change:
     ratio: Quantity
 
     def to_dict(self) -> dict[str, Any]:
-        return {"before": self.before.to_dict(), "after": self.after.to_dict(), "ratio": self.ratio.to_dict()}
+        return asdict(self)
 
 
 @dataclass(frozen=True)

@@ -16,24 +16,22 @@ from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.gap.answer.budget import Budget
 from avtorch.gap.answer.location import Location
-from avtorch.gap.answer.scope import Scope
-from avtorch.gap.answer.shrinkage import MetricShrinkage, Shrinkage
-from avtorch.gap.answer.verdict import (
-    Candidate,
-    Verdict,
-    candidate_name,
-    listed_candidates,
-    near,
-    plain,
-    plausibility,
-    verdict_of,
-)
 from avtorch.gap.engine.force_map import ForceMap
 from avtorch.gap.quantity import Quantity, frame_of, unit_of
 from avtorch.gap.result import sentences
 from avtorch.gap.result.alarm import Alarm
 from avtorch.gap.result.free_form import FreeForm
+from avtorch.gap.result.gap_budget import MetricShrinkage, Shrinkage
 from avtorch.gap.result.gap_size import GapSize
+from avtorch.gap.result.hypotheses import (
+    Candidate,
+    Scope,
+    Verdict,
+    candidate_name,
+    listed_candidates,
+    plain,
+    plausibility,
+)
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.parts import AnswerPart, force_map_of
 from avtorch.gap.result.predictive_model import PredictiveModel
@@ -60,8 +58,6 @@ __all__ = [
     "Verdict",
     "candidate_name",
     "listed_candidates",
-    "near",
-    "verdict_of",
 ]
 
 DIAGNOSIS_FILES = (
@@ -233,8 +229,8 @@ class Diagnosis(Displayed):
 
         Beyond the schema's keys it has `parts` (name or null, family, form, size and probability), `moved`, `onset_s`,
         `plausible` and `plausibility` of each effect, the last two of the verdict, `onset_from_start_s`, `setting`,
-        `remaining`, `complete`, `not_tried` (`effects` by name; `pairs`, of which "all", "some", "none" were tried, or
-        "lost") and `notes`.
+        `remaining`, `complete`, `not_tried` (`effects` by name; `pairs`, of which "all", "some", "none" were tried) and
+        `notes`.
         """
         return {
             "schema": f"avtorch.diagnosis/{1 if self.budget is None else 2}",

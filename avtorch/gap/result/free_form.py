@@ -32,7 +32,7 @@ from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.priors import MAP_SIZE
 from avtorch.gap.engine.sample import sample
-from avtorch.gap.result.output_error import STEP_S, Coefficients, Runs
+from avtorch.gap.result.output_error import STEP_S, Coefficients, Rows, Runs
 from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.force_table import ForceTable, ResistanceCurve
 from avtorch.gap.simulator.order import at_place
@@ -106,7 +106,8 @@ class FreeForm:
 
     def beside(self, car: GapPlant) -> GapPlant:
         """The car with the free form, without the gust of which it takes a part: what is left of that is not known."""
-        kept = [e for e in car.effects if "force_sd" not in e.noise_parameters]
+        still = torch.zeros(8, dtype=torch.float64)
+        kept = [e for e in car.effects if (change := e.noise(still)) is None or change.force_sd is None]
         return plant([*kept, *self.effects()], T_L=self.T_L, K_L=float(car.K_L) + self.at.gain, sigma=float(car.sigma))
 
 
@@ -119,77 +120,61 @@ class _Car:
         self.car = plant_of(h, baseline)
         data = h.data
         assert data.speed is not None
-        self.every = max(1, round(STEP_S / data.dt))
-        self.dt = self.every * data.dt
-        rows = [np.arange(i, j, self.every) for i, j in itertools.pairwise(data.bounds) if (j - i) // self.every > 2]
-        self.source = np.concatenate(rows)
-        self.starts = np.concatenate([np.arange(len(r)) == 0 for r in rows])
-        self.command = self._arriving()
-        self.speed = data.smooth_speed[self.source]
-        self.knots_u = _knots(self.command, _U_QUANTILES, zero=True)
-        self.knots_v = _knots(self.speed, _V_QUANTILES)
-        self.zero = np.append(np.zeros(len(self.knots_u) * len(self.knots_v) + len(self.knots_v) + 1), lag[0])
+        every = max(1, round(STEP_S / data.dt))
+        rows = [np.arange(i, j, every) for i, j in itertools.pairwise(data.bounds) if (j - i) // every > 2]
+        source, dt = np.concatenate(rows), every * data.dt
+        starts = np.concatenate([np.arange(len(r)) == 0 for r in rows])
+        command, speed = self._arriving(source, dt), data.smooth_speed[source]
+        knots = _knots(command, _U_QUANTILES, zero=True), _knots(speed, _V_QUANTILES)
+        self.rows = Rows(dt, command, speed, source, starts, *knots)
+        self.zero = np.append(np.zeros(len(knots[0]) * len(knots[1]) + len(knots[1]) + 1), lag[0])
         self._known: dict[tuple[float, bool], Runs] = {}
 
     def runs(self, log_lag: float, *, cut: bool = False) -> Runs:
         """The free runs of the car with that ln T_L; `cut`: none goes beyond its block."""
         if (log_lag, cut) not in self._known:
-            h = self.h.copy()
+            h, rows = self.h.copy(), self.rows
             h["T_L"] = float(np.exp(log_lag))
-            gained = h.on_grid()[1]
-            at = np.interp(h.data.time[self.source], h.data.grid.time, gained)
-            after = np.interp(h.data.time[self.source] + self.dt, h.data.grid.time, gained)
-            last = np.append(self.starts[1:], True)
+            gained, time = h.on_grid()[1], h.data.time[rows.source]
+            at, after = (np.interp(t, h.data.grid.time, gained) for t in (time, time + rows.dt))
+            last = np.append(rows.starts[1:], True)
             after[last] = at[last]  # of no run
-            self._known[log_lag, cut] = Runs.of(
-                self.dt,
-                self.command,
-                self.speed,
-                (after - at) / self.dt,
-                self.source,
-                self.starts,
-                self.knots_u,
-                self.knots_v,
-                self.edges if cut else None,
-            )
+            self._known[log_lag, cut] = Runs.of(rows, (after - at) / rows.dt, self.edges if cut else None)
         return self._known[log_lag, cut]
 
     @cached_property
     def edges(self) -> IntArray:
         """First rows of blocks of about `_BLOCK_S`, and the end of the last one (block + 1,)."""
-        rows = np.append(np.flatnonzero(self.starts), len(self.speed)).tolist()
-        length = float(np.clip(len(self.speed) * self.dt / _BLOCKS, *_BLOCK_S))
+        dt, count = self.rows.dt, len(self.rows.speed)
+        length = float(np.clip(count * dt / _BLOCKS, *_BLOCK_S))
         out = [0]
-        for i, j in itertools.pairwise(rows):
-            out += np.linspace(i, j, max(1, round((j - i) * self.dt / length)) + 1).astype(int)[1:].tolist()
+        for i, j in itertools.pairwise(np.append(np.flatnonzero(self.rows.starts), count).tolist()):
+            out += np.linspace(i, j, max(1, round((j - i) * dt / length)) + 1).astype(int)[1:].tolist()
         return np.array(out)
 
-    def _arriving(self) -> FloatArray:
-        """Commands (row,) behind the effects upstream of the actuator, as means over the steps."""
-        data, out = self.h.data, np.empty(len(self.source))
+    def _arriving(self, source: IntArray, step: float) -> FloatArray:
+        """Commands (row,) behind the effects upstream of the actuator, as means over the steps [s] from `source` on."""
+        data, out = self.h.data, np.empty(len(source))
         effects = [e for e in at_place(self.car.effects, "command") if not e.random]
         late = sum(float(e.values()[e.shift]) for e in effects if e.shift is not None)
-        row_of = np.searchsorted(self.source, data.bounds)
+        T_L, K_L = torch.as_tensor(self.car.T_L), torch.as_tensor(self.car.K_L)
+        row_of = np.searchsorted(source, data.bounds)
         for (i, j), (a, b) in zip(itertools.pairwise(data.bounds), itertools.pairwise(row_of), strict=True):
             if a == b:
                 continue
             u, t = data.command[i:j], data.time[i:j]
             speed, dt = torch.as_tensor(data.smooth_speed[i:j]), torch.tensor(data.dt)
-            row = EffectContext(
-                torch.as_tensor(t), dt, speed, None, torch.as_tensor(self.car.T_L), torch.as_tensor(self.car.K_L)
-            )
+            row = EffectContext(torch.as_tensor(t), dt, speed, None, T_L, K_L)
             for e in effects:
                 if e.shift is None:
                     u = e.over(torch.as_tensor(u), row).numpy()
-            whole = np.append(0.0, np.cumsum(u * data.dt))
-            ends = np.append(t, t[-1] + data.dt)
-            begins = data.time[self.source[a:b]] - late
-
+            whole, ends = np.append(0.0, np.cumsum(u * data.dt)), np.append(t, t[-1] + data.dt)
+            begins = data.time[source[a:b]] - late
             since, until = (
                 np.interp(x, ends, whole) + np.minimum(x - ends[0], 0.0) * u[0]
-                for x in (begins, np.minimum(begins + self.dt, ends[-1]))
+                for x in (begins, np.minimum(begins + step, ends[-1]))
             )
-            out[a:b] = (until - since) / self.dt
+            out[a:b] = (until - since) / step
         return out
 
 
@@ -216,11 +201,12 @@ class _Prior:
     """Precision of the coefficients that move at given sizes: those of table and curve, the gain, and ln T_L."""
 
     def __init__(self, car: _Car, sizes: Sizes) -> None:
-        u, v = car.command, car.speed
-        along_u = _matern(car.knots_u / max(float(u.std()), 1e-9))
-        z = (car.knots_v - v.mean()) / max(float(v.std()), 1e-9)
+        rows = car.rows
+        u, v = rows.command, rows.speed
+        along_u = _matern(rows.knots_u / max(float(u.std()), 1e-9))
+        z = (rows.knots_v - v.mean()) / max(float(v.std()), 1e-9)
         along_v = _matern(z)
-        scale = max(float(np.diff(v)[~car.starts[1:]].std()) / car.dt, 1e-3)
+        scale = max(float(np.diff(v)[~rows.starts[1:]].std()) / rows.dt, 1e-3)
         table = np.kron(along_u, np.ones_like(along_v)) + 0.5 * np.kron(along_u, along_v)
         curve = 1.0 + np.outer(z, z) + along_v
         blocks, moves = [], []
@@ -264,7 +250,7 @@ class _Fit:
 def drive(car: _Car, x: FloatArray, *, slopes: bool = False, cut: bool = False) -> tuple[FloatArray, FloatArray]:
     """Errors (error,) of the runs at coefficients, and their slopes but for ln T_L."""
     runs = car.runs(float(x[-1]), cut=cut)
-    return runs.drive(float(np.exp(x[-1])), Coefficients.of(x[:-1], runs.shape), slopes=slopes)
+    return runs.drive(float(np.exp(x[-1])), Coefficients.of(x[:-1], car.rows.shape), slopes=slopes)
 
 
 def _fitted(car: _Car, sizes: Sizes, x: FloatArray, independent: float) -> _Fit:
@@ -309,7 +295,7 @@ class LeftOut:
         count = len(edges) - 1
         labels = [np.arange(count) % min(count, _FOLDS)]
         if count >= 6:
-            labels.append(_alike(runs, edges))
+            labels.append(_alike(runs.rows, edges))
         each = [(w, label[block] == k) for w, label in enumerate(labels) for k in np.unique(label)]
         each = [(w, told) for w, told in each if told.any() and not told.all()]
         return cls(np.array([t for _, t in each]), np.array([w for w, _ in each])) if len(each) > 2 else None
@@ -320,7 +306,7 @@ class LeftOut:
         return float(max(np.log(squares[self.way == w].sum() / over[self.way == w].sum()) for w in ways))
 
 
-def _alike(runs: Runs, edges: IntArray) -> IntArray:
+def _alike(runs: Rows, edges: IntArray) -> IntArray:
     """Clusters (block,) of blocks by what was driven, none with much more than a third of them (Ward 1963)."""
     rows = list(itertools.pairwise(edges.tolist()))
     x = np.array(
@@ -399,25 +385,26 @@ class FittedForm:
         """Whether it foretells blocks left out better than names alone, and than the baseline."""
         return self.form.sizes.any and self.score < min(self.named, 0.0)
 
-    def without(self, rows: Sequence[slice]) -> FloatArray:
+    def without(self, without: Sequence[slice]) -> FloatArray:
         """Acceleration [m/s²] on the grid that it adds to the hypothesis at `lagged`, taught by the other rows."""
-        car, runs = self.car, self.car.runs(float(self.x[-1]), cut=True)
-        first, last = car.source[runs.first], car.source[runs.end - 1]
-        held = np.any([(last >= r.start) & (first < r.stop) for r in rows], axis=0)
+        car, rows, runs = self.car, self.car.rows, self.car.runs(float(self.x[-1]), cut=True)
+        first, last = rows.source[runs.first], rows.source[runs.end - 1]
+        held = np.any([(last >= r.start) & (first < r.stop) for r in without], axis=0)
         x = self.x
         if held.any() and not held.all():
             left = LeftOut(held[None], np.zeros(1, np.int64))
             products = _Products(_Fit(car, x, cut=True), left)
             x = x + products.steps(_Prior(car, self.form.sizes), self.independent)[0]
-        at = Coefficients.of(x[:-1], runs.shape)
-        force = ForceMap(car.knots_u, car.knots_v, at.table, 0.0)(car.command, car.speed) + at.gain * car.command
-        keep, lagged = np.exp(-car.dt / self.form.T_L), np.empty_like(force)
-        begins = np.append(np.flatnonzero(car.starts), len(force))
+        at = Coefficients.of(x[:-1], car.rows.shape)
+        force = ForceMap(rows.knots_u, rows.knots_v, at.table, 0.0)(rows.command, rows.speed)
+        force = force + at.gain * rows.command
+        keep, lagged = np.exp(-rows.dt / self.form.T_L), np.empty_like(force)
+        begins = np.append(np.flatnonzero(rows.starts), len(force))
         for i, j in itertools.pairwise(begins):
             lagged[i:j] = lfilter([1 - keep], [1, -keep], force[i:j], zi=[keep * force[i]])[0]
         data = car.h.data
-        adds = lagged + np.interp(car.speed, car.knots_v, at.curve)
-        return np.interp(data.grid.time, data.time[car.source], adds)
+        adds = lagged + np.interp(rows.speed, rows.knots_v, at.curve)
+        return np.interp(data.grid.time, data.time[rows.source], adds)
 
     @property
     def lagged(self) -> Hypothesis:
@@ -441,7 +428,7 @@ def fitted_form(h: Hypothesis, baseline: GapPlant | None, bare: Hypothesis) -> F
     left = LeftOut.of(runs, car.edges) if len(runs.of_run) else None
     if left is None:
         return None
-    independent = max(len(runs.speed) * runs.dt / INDEPENDENT_S, 3.0)
+    independent = max(len(car.rows.speed) * car.rows.dt / INDEPENDENT_S, 3.0)
     base = _Car(bare, baseline, (float(np.log(bare["T_L"])), 1.0))
     over = _squares(_Fit(base, base.zero, cut=True), _Prior(base, Sizes(0.0, 0.0)), left, independent)
     errors = drive(car, car.zero, cut=True)[0]
@@ -487,8 +474,8 @@ def _descended(
         sizes = best
         fit = _fitted(car, sizes, fit.x, independent)
     told = _squares(_Fit(car, fit.x, cut=True), _Prior(car, sizes), left, independent)
-    at = Coefficients.of(fit.x[:-1], fit.runs.shape)
-    form = FreeForm(car.knots_u, car.knots_v, at, sizes, float(np.exp(fit.x[-1])))
+    at = Coefficients.of(fit.x[:-1], car.rows.shape)
+    form = FreeForm(car.rows.knots_u, car.rows.knots_v, at, sizes, float(np.exp(fit.x[-1])))
     score_of = left.worse(told, over) + 2 * sizes.nats / independent
     return FittedForm(car.h, form, score_of, left.worse(named, over), car, fit.x, independent)
 

@@ -9,19 +9,18 @@ are the bootstrap's over blocks (Efron and Tibshirani 1993). Blocks measure what
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.answer.budget import LIKELY, MATERIAL, Budget, ChancePart, ChannelError, Part, Unexplained
-from avtorch.gap.answer.plausibility import implausible
-from avtorch.gap.answer.shrinkage import MetricShrinkage, Shrinkage
 from avtorch.gap.engine.average import ModelAverage
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.held_out import HeldOut
-from avtorch.gap.result.hypotheses import aliases_of, onset_of, part_probability
+from avtorch.gap.result.hypotheses import aliases_of, implausible, onset_of, part_probability
 from avtorch.gap.result.parameters import ParameterPosterior
 from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.io import Log
@@ -31,6 +30,63 @@ CHANCE = ("gust", "outliers", "command_hold")
 _RESAMPLES = 400
 _NOTHING = 1e-3  # of the energy before, below which free runs show no gap
 _NO_GAP = 0.1  # share of the error before that is within the floor: nothing to close
+
+
+@dataclass(frozen=True)
+class MetricShrinkage:
+    """Errors by one measure: `before` the effect is added, `after`, and the `floor` that no model can go below.
+
+    `closed`: (before - after) / (before - floor), None where there is almost nothing to close. Rollout errors are root
+    mean squares [m/s², m/s]; densities are mean log densities per row [nats], of which higher is better.
+
+    `horizon_s`: length of the rollouts [s], None for those of whole drives and for densities.
+    """
+
+    before: float
+    after: float
+    floor: float
+    closed: Quantity | None
+    horizon_s: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Shrinkage:
+    """How far the gap shrinks on held-out blocks of the drives.
+
+    `metric`: the one of `by_metric` in which the gap is clearest. `placebo`: what `placebo_effect`, a wrong effect with
+    about as many parameters, closes when added. `ceiling`: error after a flexible black box is added to the bare
+    baseline, by metric. `blocks`: number of held-out blocks. `by_drives`: whole drives were held out.
+    """
+
+    metric: str
+    by_metric: Mapping[str, MetricShrinkage]
+    placebo_effect: str | None
+    placebo: Quantity | None
+    ceiling: Mapping[str, float]
+    blocks: int
+    by_drives: bool = False
+
+    @property
+    def top(self) -> MetricShrinkage:
+        return self.by_metric[self.metric]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The object `shrinkage` of `diagnosis.json`."""
+        placebo = None if self.placebo is None else self.placebo.to_dict()
+        return {
+            "metric": self.metric,
+            "heldout": True,
+            **self.top.to_dict(),
+            "by_metric": {name: closed.to_dict() for name, closed in self.by_metric.items()},
+            "placebo": {"effect": self.placebo_effect, "closed": placebo},
+            "ceiling": dict(self.ceiling),
+            "chosen": None,
+            "blocks": self.blocks,
+            "heldout_by": "drives" if self.by_drives else "blocks",
+        }
 
 
 def budget_of(
@@ -91,7 +147,7 @@ def budget_of(
     beyond = float((rest > material).mean()) if parts else 0.0
     matters = beyond > 0.95 if parts else tuple(names) == ("unknown",)
     most = max(sum(p.share.mean for p in parts), 1.0)  # an effect without a name may cost instead of taking off
-    parts = [replace(p, share=_scaled(p.share, 1 / most)) for p in parts]
+    parts = [replace(p, share=p.share.scaled(1 / most)) for p in parts]
     unnamed = _shifted(unnamed, 1 - sum(p.share.mean for p in parts) - unnamed.mean)
     by_channel = {
         name: ChannelError(*(float(np.sqrt(x)) for x in levels))
@@ -149,7 +205,6 @@ def shrinkage_of(held: HeldOut, seed: int = 0) -> Shrinkage:
         placebo_effect=None,
         placebo=None,
         ceiling=ceiling,
-        chosen=None,
         blocks=blocks,
         by_drives=held.blocks.by_drives,
     )
@@ -217,10 +272,6 @@ def _quantity(draws: FloatArray) -> Quantity:
     q05, q95 = np.quantile(draws, (0.05, 0.95))
     mean = float(draws[0])
     return Quantity(mean, float(draws.std()), float(min(q05, mean)), float(max(q95, mean)))
-
-
-def _scaled(q: Quantity, by: float) -> Quantity:
-    return Quantity(q.mean * by, q.sd * by, q.q05 * by, q.q95 * by)
 
 
 def _shifted(q: Quantity, by: float) -> Quantity:

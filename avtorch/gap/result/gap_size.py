@@ -1,4 +1,9 @@
-"""Size of the gap: errors of the fitted baseline in one step and over seconds, and those of the best hypothesis."""
+"""Size of the gap: errors of the fitted baseline in one step and over seconds, and those of the best hypothesis.
+
+Where commands were given twice, preceded by equal commands for some seconds, the actuator starts from the same state.
+Half the mean square difference of the responses is then noise, plus whatever does not depend on the commands (another
+speed, a road grade, an onset between the two): a floor that involves no fit.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +11,18 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import fftconvolve
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.counted import Counted
-from avtorch.gap.result.repeatability import Repeatability, repeatability
-from avtorch.gap.rollout_errors import HORIZON_S, RolloutMetric, reached, rms
+from avtorch.gap.result.counted_rows import CountedRows
+from avtorch.gap.rollout_errors import HORIZON_S, reached, rms
+
+WINDOW_S = 10.0
+SETTLED_S = 3.0
+"""Time from a window's start after which the actuator has forgotten its earlier state [s]."""
+_ALIKE = 0.02  # tolerance, relative to the spread of the commands
+_LIVELY_MPS2 = 0.2
 
 
 class Simulated(NamedTuple):
@@ -18,6 +30,29 @@ class Simulated(NamedTuple):
 
     errors: FloatArray
     lag: float
+
+
+@dataclass(frozen=True)
+class Repeatability:
+    """Noise floor from `pairs` pairs of windows: `seconds` [s] compared, root mean squares `accel` [m/s²] and `speed`
+    [m/s].
+
+    The speed's is of its change since the settling time. None where the log lacks the channel.
+    """
+
+    pairs: int
+    seconds: float
+    accel: float | None
+    speed: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The object `repeatability` of `gap` in `diagnosis.json`."""
+        return {
+            "pairs": self.pairs,
+            "seconds": self.seconds,
+            "floor_accel": self.accel,
+            "floor_speed": self.speed,
+        }
 
 
 @dataclass(frozen=True)
@@ -54,7 +89,7 @@ class GapSize:
 
 
 def gap_size(
-    rows: Counted,
+    rows: CountedRows,
     none: Simulated,
     best: Simulated,
     *,
@@ -67,40 +102,70 @@ def gap_size(
     the measurement at every row, and last `HORIZON_S` or as long as the longest stretch: the measures are those of
     `shrinkage`, here over all counted rows. None where the log lacks the channel.
     """
-    one: list[float] = []
-    if rows.accel is not None:
-        one = [_one_step(rows, x.errors[0], x.lag) for x in (none, best)]
-    usual = {name: RolloutMetric(name, HORIZON_S) for name in rows.channels}
-    rollout = {name: [rms(m, rows, x.errors, none.lag) for x in (none, best)] for name, m in usual.items()}
-    accel, speed = (rollout.get(name, []) for name in ("accel", "speed"))
+    one = [] if rows.accel is None else [_one_step(rows, x.errors[0], x.lag) for x in (none, best)]
+    before, after = (rms(rows, x.errors, none.lag) for x in (none, best))
     return GapSize(
         detected=detected,
         p_value=p_value,
         one_step_rmse=one[0] if one else None,
         one_step_floor=min(one, default=None),
-        rollout_rmse_accel=accel[0] if accel else None,
-        rollout_floor_accel=min(accel, default=None),
-        rollout_rmse_speed=speed[0] if speed else None,
-        horizon_s=reached(usual[rows.channels[0]], rows),
+        rollout_rmse_accel=before.get("accel"),
+        rollout_floor_accel=min(before["accel"], after["accel"]) if "accel" in before else None,
+        rollout_rmse_speed=before.get("speed"),
+        horizon_s=reached(rows, HORIZON_S),
         repeats=repeatability(rows),
     )
 
 
-def _one_step(record: Counted, errors: FloatArray, lag: float) -> float:
+def _one_step(record: CountedRows, errors: FloatArray, lag: float) -> float:
     """RMS error of the acceleration predicted for a row from the measurement one row earlier.
 
     A rollout error decays with the lag, so the one-step error is `e[k+1] - exp(-dt / T_L) e[k]`: for GLVD exactly the
     error of its zero-order hold from the measured acceleration.
     """
     keep = float(np.exp(-record.dt / record.group / lag))
-    steps = [x[1:] - keep * x[:-1] for x in map(np.ravel, _stretches(record, errors))]
-    return _size(np.concatenate(steps))
+    steps = [x[1:] - keep * x[:-1] for x in map(np.ravel, np.split(errors, record.starts[1:]))]
+    return float(np.sqrt((np.concatenate(steps) ** 2).mean()))
 
 
-def _stretches(record: Counted, values: FloatArray) -> list[FloatArray]:
-    """`values` (counted, ...) of each stretch without gaps."""
-    return np.split(values, record.starts[1:])
+def repeatability(record: CountedRows) -> Repeatability | None:
+    """The repeatability from windows with repeated commands; None where there are none."""
+    rows, settled = round(WINDOW_S / record.dt), round(SETTLED_S / record.dt)
+    found = list(_pairs(record.command[record.source], record.stretch, rows))
+    if not found:
+        return None
+    floors: dict[str, float] = {}
+    for name, measured in zip(record.channels, record.measured, strict=True):
+        each = []
+        for first, second in found:
+            one, other = (measured[k + settled : k + rows].ravel() for k in (first, second))
+            if name == "speed":
+                one, other = one - one[0], other - other[0]
+            each.append(one - other)
+        floors[name] = float(np.sqrt(0.5 * np.mean(np.concatenate(each) ** 2)))
+    seconds = len(found) * (rows - settled) * record.dt
+    return Repeatability(len(found), seconds, floors.get("accel"), floors.get("speed"))
 
 
-def _size(x: FloatArray) -> float:
-    return float(np.sqrt((x**2).mean()))
+def _pairs(command: FloatArray, stretch: NDArray[np.intp], rows: int) -> list[tuple[int, int]]:
+    """Starts of pairs of windows of `rows` rows with the same commands; no row is in two windows."""
+    last = len(command) - rows
+    if last < rows:
+        return []
+    whole = stretch[: last + 1] == stretch[rows - 1 :]
+    sums = np.concatenate([[0.0], np.cumsum(command**2)])
+    squares = sums[rows:] - sums[:-rows]
+    free = np.ones(len(command), bool)
+    found = []
+    for first in range(0, last + 1, max(rows // 2, 1)):
+        own = command[first : first + rows]
+        if not whole[first] or not free[first : first + rows].all() or own.std() < _LIVELY_MPS2:
+            continue
+        away = (squares + squares[first] - 2 * fftconvolve(command, own[::-1], "valid")) / rows
+        away[: first + rows] = np.inf
+        away[~whole] = np.inf
+        second = int(away.argmin())
+        if away[second] <= (_ALIKE * own.std()) ** 2 and free[second : second + rows].all():
+            free[first : first + rows] = free[second : second + rows] = False
+            found.append((first, second))
+    return found

@@ -52,9 +52,8 @@ class HeldOut:
     `rival`: of the last hypothesis with that black box alone.
     `steps`: scores of each hypothesis of `chain`, then of the last one with the `free` form, if there is one; `floor`,
     `ceiling`: of the last and the first hypothesis with a black box on top (`black_box_rest`), the floor no higher than
-    the last step. `values` (hypothesis, fold, parameter): as
-    each fold's other blocks teach them. `errors`, `predicted` (channel, row) [m/s²]: of acceleration and differenced
-    speed, what the last hypothesis leaves and what the black box foretells of it. `horizon_s` of the free runs.
+    the last step. `possible` (draw, channel, block): squares of free runs of what the black box may have missed.
+    `horizon_s` of the free runs.
     """
 
     chain: tuple[Hypothesis, ...]
@@ -63,9 +62,6 @@ class HeldOut:
     floor: Scores
     rival: Scores
     ceiling: Scores
-    values: FloatArray = field(repr=False)
-    errors: FloatArray = field(repr=False)
-    predicted: FloatArray = field(repr=False)
     possible: FloatArray = field(repr=False)
     horizon_s: float
     free: bool = False
@@ -126,12 +122,12 @@ def held_out_errors(chain: Sequence[Hypothesis], free: FittedForm | None = None)
     fitted = [_taught(h, blocks) for h in chain]
     stitched = [blocks.stitched(list(x.errors)) for x in fitted]
     scored = [_scores(data, blocks, e, x.residuals, x.residuals) for x, e in zip(fitted, stitched, strict=True)]
-    beside, foretold, possible = [], [], []
+    beside, possible = [], []
     for x, errors in ((fitted[-1], stitched[-1]), (fitted[0], stitched[0])):
         found = BlackBox.of(x.hypothesis).predict(x.residuals, errors, blocks)
         possible.append(found.possible)
-        foretold.append(blocks.stitched(list(found.readings)))
-        beside.append(_scores(data, blocks, errors - foretold[-1], x.residuals, x.residuals - found.coefficients))
+        rest = errors - blocks.stitched(list(found.readings))
+        beside.append(_scores(data, blocks, rest, x.residuals, x.residuals - found.coefficients))
     floor = beside[0]
     if free is not None:
         scored.append(_with_form(free, blocks))
@@ -144,9 +140,6 @@ def held_out_errors(chain: Sequence[Hypothesis], free: FittedForm | None = None)
         floor=floor,
         rival=beside[0],
         ceiling=beside[1],
-        values=np.stack([x.values for x in fitted]),
-        errors=np.stack(compared(data, stitched[-1])),
-        predicted=np.stack(compared(data, foretold[0])),
         possible=possible[0],
         horizon_s=min(HORIZON_S, longest),
         free=free is not None,
@@ -178,11 +171,10 @@ def entered(before: Hypothesis, after: Hypothesis) -> str:
 # fits -----------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class _Taught:
-    """A hypothesis fitted without each fold: `values` (fold, parameter), residuals of all frames (fold, channel, frame,
-    bin), and errors (fold, channel, row) of readings."""
+    """A hypothesis fitted without each fold: residuals of all frames (fold, channel, frame, bin), and errors (fold,
+    channel, row) of readings."""
 
     hypothesis: Hypothesis
-    values: FloatArray
     residuals: FloatArray
     errors: FloatArray
 
@@ -190,15 +182,14 @@ class _Taught:
 def _taught(h: Hypothesis, blocks: Blocks) -> _Taught:
     h = _without_chance(h)
     slopes, *_ = linearised(h, h.free)
-    values, residuals, errors = [], [], []
+    residuals, errors = [], []
     for frames in blocks.taught:
         fold, taught = h.copy(), _fold_fit(h, slopes, frames)
         fold.values, fold.force_coefficients = taught.values, taught.force_coefficients
         rows = readings(fold, *fold.on_grid())
-        values.append(fold.values)
         residuals.append(h.data.measured - h.data.transform(compared(h.data, rows)))
         errors.append(measured_readings(h.data) - rows)
-    return _Taught(h, np.array(values), np.array(residuals), np.array(errors))
+    return _Taught(h, np.array(residuals), np.array(errors))
 
 
 def _fold_fit(h: Hypothesis, slopes: FloatArray, frames: BoolArray) -> Hypothesis:

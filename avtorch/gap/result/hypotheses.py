@@ -1,27 +1,212 @@
-"""The engine's posterior as the answer's hypotheses: probabilities, parameters, the verdict."""
+"""The engine's posterior as the answer's hypotheses: probabilities, parameters, what was tried, the verdict.
+
+A fit is implausible where the whole central 90 % of a parameter lies outside what is physically possible: the name is
+then right about the shape of the gap and wrong about its origin.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Self
 
+from avtorch.errors import InputError
 from avtorch.gap.answer.budget import LIKELY
-from avtorch.gap.answer.plausibility import implausible
-from avtorch.gap.answer.verdict import ALIAS_RATIO, ALWAYS, Candidate, Verdict, candidate_name
 from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.coordinates import base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.outliers import rate_onset
-from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.own_random import OwnRandom
-from avtorch.gap.result.parameters import ParameterPosterior
-from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.quantity import Quantity, unit_of
+from avtorch.gap.result.parameters import OwnRandom, ParameterPosterior
+from avtorch.gap.simulator.effect import EFFECTS, Effect, candidate_name, delay_effect
+from avtorch.gap.simulator.effect_response import is_observable
+from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.plant import BASELINE, GapPlant
 from avtorch.io import Log
 
+ALWAYS = ("none", "unknown")
+LEAST_LISTED = 1e-4
+"""Hypotheses less probable than this are left out of an answer; `none` and `unknown` never are."""
+ALIAS_RATIO = 0.03
+"""Hypotheses at least this probable, relative to the most probable one, are not distinguished from it."""
 _HELD = 0.9  # probability that an alias set holds
 _MOST_ALIASES = 6
-_LEAST = 1e-4
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A hypothesis: `"none"`, `"unknown"`, an effect, or two (`"a+b"`, in alphabetical order).
+
+    `log_evidence` [nats] relative to `none`, without the prior over causes; None for `unknown`. `parameters` by the
+    table's names, those of a pair as `effect.parameter`; `moved`: the baseline's `T_L` [s] and `K_L` [-] under this
+    hypothesis. `onset_s` on the log's own clock; None where the effect acts from the start. `implausible`: a sentence
+    for each parameter outside its physically possible range (`implausible`).
+    """
+
+    name: str
+    probability: float
+    log_evidence: float | None = None
+    parameters: Mapping[str, Quantity] = field(default_factory=dict)
+    moved: Mapping[str, Quantity] = field(default_factory=dict)
+    onset_s: float | None = None
+    implausible: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.name != candidate_name(self.name):
+            raise InputError(f"candidate: found {self.name!r}, needs {candidate_name(self.name)!r}")
+        if not 0 <= self.probability <= 1 + 1e-9:
+            raise InputError(f"{self.name}: found probability {self.probability!r}, needs 0 to 1")
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Its effects: none, one or two."""
+        return () if self.name in ALWAYS else tuple(self.name.split("+"))
+
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `effects`."""
+        return {
+            "name": self.name,
+            "probability": self.probability,
+            "log_evidence": self.log_evidence,
+            "parameters": plain(self.parameters),
+            "moved": plain(self.moved),
+            "onset_s": self.onset_s,
+            **plausibility(self.implausible),
+        }
+
+
+def plausibility(implausible: Sequence[str]) -> dict[str, Any]:
+    """The keys `plausible` and, where it is False, `plausibility` with the reasons."""
+    return {"plausible": not implausible, "plausibility": " ".join(implausible) or None}
+
+
+def listed_candidates(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
+    """Hypotheses as listed in an answer: improbable ones left out, renormalised to a sum of 1, most probable first.
+
+    Raises `InputError` where `none` or `unknown` is missing, a name occurs twice, or no probability is above 0.
+    """
+    given = list(candidates)
+    names = [c.name for c in given]
+    if len(set(names)) < len(names) or not set(ALWAYS) <= set(names):
+        raise InputError(f"candidates: found {', '.join(names)}, needs none and unknown and each name once")
+    # improbable by their share, so that weights need not be normalised
+    total = math.fsum(c.probability for c in given)
+    if not total > 0:
+        raise InputError("candidates: found no probability above 0, needs one")
+    kept = [c for c in given if c.name in ALWAYS or c.probability >= LEAST_LISTED * total]
+    total = math.fsum(c.probability for c in kept)
+    kept.sort(key=lambda c: -c.probability)
+    shares = [c.probability / total for c in kept]
+    shares[0] = 1 - math.fsum(shares[1:])
+    return tuple(replace(c, probability=share) for c, share in zip(kept, shares, strict=True))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The named causes, and the hypotheses that cannot be distinguished from them.
+
+    `names`: `("none",)`, `("unknown",)`, or the effects, the one with the largest share of the gap first. `alias_set`:
+    the hypotheses that this log cannot distinguish, including the verdict. `abstained`: it is `unknown`. `why`: one
+    sentence. `partial`: effects are named, and something reproducible is left that no known effect explains.
+    """
+
+    names: tuple[str, ...]
+    alias_set: tuple[str, ...]
+    abstained: bool
+    why: str
+    partial: bool = False
+
+    @property
+    def name(self) -> str:
+        """The verdict as a hypothesis's name."""
+        return candidate_name(self.names)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "names": list(self.names),
+            "alias_set": list(self.alias_set),
+            "abstained": self.abstained,
+            "partial": self.partial,
+            "why": self.why,
+        }
+
+
+def plain(quantities: Mapping[str, Quantity]) -> dict[str, dict[str, float]]:
+    """Quantities as plain numbers, for JSON."""
+    return {name: quantity.to_dict() for name, quantity in quantities.items()}
+
+
+@dataclass(frozen=True)
+class Scope:
+    """What a search tried: names of single effects `scored` and `not_scored`, and which `pairs`.
+
+    `not_scored`: effects excluded by the budget or by the user. `pairs`: "all" that screening selected, "some" before
+    the budget ended, or "none".
+    """
+
+    scored: tuple[str, ...] = ()
+    not_scored: tuple[str, ...] = ()
+    pairs: Literal["all", "some", "none"] = "all"
+
+    @classmethod
+    def of(
+        cls,
+        effects: Sequence[type[Effect]],
+        tried: Collection[str],
+        channels: Collection[str],
+        pairs: Literal["all", "some", "none"],
+    ) -> Self:
+        """The scope of a search among `effects`, limited to those observable in `channels`; `tried`: by name."""
+        own = {e.name: e for e in effects}
+        kinds = own | {n: e for n, e in EFFECTS.items() if n not in own}
+        names = [n for n, e in kinds.items() if is_observable(e, channels)]
+        return cls(tuple(n for n in names if n in tried), tuple(n for n in names if n not in tried), pairs)
+
+    @property
+    def whole(self) -> bool:
+        """Whether every hypothesis was tried."""
+        return not self.not_scored and self.pairs == "all"
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"effects": list(self.not_scored), "pairs": self.pairs}
+
+
+def implausible(
+    parameters: Mapping[str, Quantity],
+    moved: Mapping[str, Quantity],
+    effects: Iterable[type[Effect]] = (),
+) -> tuple[str, ...]:
+    """A sentence for each parameter whose central 90 % lies outside what is physically possible.
+
+    `parameters` of a candidate's `effects`, by their own names or as `effect.parameter`; `moved`: T_L [s] and K_L.
+    """
+    sentences = []
+    for effect in effects:
+        for p in (*effect.parameters, *effect.derived):
+            q = parameters.get(f"{effect.name}.{p.name}", parameters.get(p.name))
+            if q is not None and (p.reported or p in effect.derived) and outside(p, q):
+                sentences.append(
+                    f"{_sentence(f'{effect.name}.{p.name}', p, q)}; the effect stands in for something else."
+                )
+    sentences += [
+        f"{_sentence(p.name, p, moved[p.name])}." for p in BASELINE if p.name in moved and outside(p, moved[p.name])
+    ]
+    return tuple(sentences)
+
+
+def outside(parameter: Parameter, q: Quantity) -> bool:
+    """Whether the central 90 % lies entirely outside the possible range."""
+    low, high = parameter.physical
+    return q.q95 < low or q.q05 > high
+
+
+def _sentence(name: str, p: Parameter, q: Quantity) -> str:
+    unit = unit_of(p.name)
+    low, high = p.physical
+    why = p.beyond or f"possible are {low:.2g} to {high:.2g}"
+    return f"{name} is {q.mean:.2g}{'' if unit == '-' else ' ' + unit}, typical {p.low:.2g} to {p.high:.2g}: {why}"
 
 
 @dataclass(frozen=True)
@@ -64,15 +249,15 @@ def _rate_onset(h: Hypothesis, rows: Sequence[int]) -> float | None:
     return rate_onset(data.time[list(rows)], float(data.time[0]), float(data.time[-1]))[1]
 
 
-def verdict_names(average: ModelAverage, shares: Mapping[str, float] | None = None) -> tuple[str, ...]:
+def verdict_names(average: ModelAverage) -> tuple[str, ...]:
     """Causes of the most probable hypothesis that, they or their aliases, are there with a probability of a half or
-    more, and others of which that holds by themselves, the largest of `shares` first; `("none",)` or `("unknown",)`,
-    the more probable, where there are none."""
+    more, and others of which that holds by themselves, the likeliest first; `("none",)` or `("unknown",)`, the more
+    probable, where there are none."""
     names = {n for label in average.probabilities for n in label.split("+")} - set(ALWAYS)
     own = set(average.label.split("+"))
     likely = [n for n in names if (part_probability(average, n) if n in own else average.marginal(n)) >= LIKELY]
     if likely:
-        return tuple(sorted(likely, key=lambda n: (-(shares or {}).get(n, 0.0), -average.marginal(n), n)))
+        return tuple(sorted(likely, key=lambda n: (-average.marginal(n), n)))
     return (max(ALWAYS, key=lambda n: average.probabilities[n]),)
 
 
@@ -153,7 +338,7 @@ def candidates_of(
             else ParameterPosterior(weight, own=random)
         )
         posteriors[label] = own
-        parameters: dict[str, Quantity] = {} if label == "none" or p < _LEAST else own.named()
+        parameters: dict[str, Quantity] = {} if label == "none" or p < LEAST_LISTED else own.named()
         moved = own.moved()
         odd = implausible(parameters, moved, [k for k in kinds if k.name in label.split("+")])
         onset = None if label == "none" else first_onset(weight, label.split("+"), logs)
@@ -175,3 +360,37 @@ def verdict(average: ModelAverage, names: tuple[str, ...], known: str, partial: 
     """The verdict of these names."""
     label = candidate_name(names)
     return Verdict(names, alias_set(average, label), label == "unknown", why(average, names, known), partial)
+
+
+def given_dead_time(
+    candidates: Sequence[Candidate], verdict: Verdict, baseline: GapPlant | None = None
+) -> tuple[Candidate, ...] | None:
+    """Hypotheses for the other causes, given that the delay is one of the causes; the most probable first.
+
+    `none` is the delay alone, an effect's name its pair with the delay. Probabilities are proportional to those of the
+    `candidates` with the delay, including the penalty of a second cause; `unknown` keeps its own. They sum to 1.
+    `log_evidence` is relative to the delay alone, `parameters` are the second effect's, `moved` is with both effects.
+
+    None where the baseline is more than bare GLVD, the verdict does not contain the delay, or no pair was tried.
+    """
+    delay = delay_effect().name
+    late = [c for c in candidates if delay in c.effects]
+    alone = next((c for c in late if c.name == delay), None)
+    if delay not in verdict.names or alone is None or len(late) < 2 or (baseline is not None and baseline.effects):
+        return None
+    total = sum(c.probability for c in late)
+    unknown = next((c.probability for c in candidates if c.name == "unknown"), 0.0)
+    out = [Candidate("unknown", unknown)]
+    for c in late:
+        second = "+".join(name for name in c.effects if name != delay)
+        own = {k.removeprefix(f"{second}."): q for k, q in c.parameters.items() if k.startswith(f"{second}.")}
+        out.append(
+            replace(
+                c,
+                name=second or "none",
+                probability=(1 - unknown) * c.probability / total,
+                log_evidence=(c.log_evidence or 0.0) - (alone.log_evidence or 0.0),
+                parameters=own if second else {},
+            )
+        )
+    return tuple(sorted(out, key=lambda c: -c.probability))

@@ -14,8 +14,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.gap.blocks import FEWEST_BLOCKS, blocks_of
-from avtorch.gap.drive_record import Record
+from avtorch.gap.drive_record import FEWEST_BLOCKS, Record, blocks_of
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import jacobian, prior_terms, whitened_jacobian
 from avtorch.gap.engine.joint import block_scores

@@ -79,8 +79,7 @@ def manoeuvres(traces: Traces, *, most: int = 6, named: bool = True) -> tuple[Ma
     """
     if len(traces.time) < 2:
         return ()
-    inside = np.diff(traces.stretch) == 0
-    step = float(np.median(np.diff(traces.time)[inside])) if inside.any() else 0.05
+    step = traces.step
     low, high = np.quantile(traces.command, (0.05, 0.95))
     least = max(_LEAST, _SHARE * float(high - low))
     lines = _accelerations(traces, step, named=named)
@@ -88,7 +87,7 @@ def manoeuvres(traces: Traces, *, most: int = 6, named: bool = True) -> tuple[Ma
     energy = np.concatenate([[0.0], np.cumsum(before**2)])
     whole = float(energy[-1]) or 1.0
     found = []
-    for stretch in _stretches(traces):
+    for stretch in traces.stretches:
         for first, last in _changes(traces.command, stretch, step, least):
             kind = _kind(traces, stretch, first, last, step, least)
             begin = max(first - round(BEFORE_S / step), stretch[0])
@@ -125,10 +124,6 @@ def _answered(
     return Manoeuvre(kind, log, rows, begin, end, change, share, part, responses)
 
 
-def _stretches(traces: Traces) -> list[IntArray]:
-    return np.split(np.arange(len(traces.time)), np.flatnonzero(np.diff(traces.stretch)) + 1)
-
-
 def _chosen(ranked: Sequence[_Change], most: int) -> list[_Change]:
     taken: list[_Change] = []
     for limit in (max(1, most // 2), most):
@@ -154,7 +149,7 @@ def _accelerations(traces: Traces, step: float, *, named: bool) -> dict[str, Flo
 def _slope(speed: FloatArray, traces: Traces, half: int, step: float) -> FloatArray:
     """Of a speed, about each row; at the ends of a stretch that of the nearest row that has one."""
     slope = np.empty_like(speed)
-    for rows in _stretches(traces):
+    for rows in traces.stretches:
         if len(rows) <= 2 * half:
             slope[rows] = 0.0 if len(rows) < 2 else (speed[rows[-1]] - speed[rows[0]]) / (step * (len(rows) - 1))
             continue

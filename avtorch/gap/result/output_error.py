@@ -41,88 +41,70 @@ class Coefficients(NamedTuple):
         nodes = shape[0] * shape[1]
         return cls(vector[:nodes].reshape(shape), vector[nodes:-1], float(vector[-1]))
 
-    @property
-    def vector(self) -> FloatArray:
-        return np.concatenate([self.table.ravel(), self.curve, [self.gain]])
 
+class Rows(NamedTuple):
+    """Rows of all stretches, `dt` [s] apart, about `STEP_S`.
 
-@dataclass(frozen=True, eq=False)
-class Runs:
-    """Rows `STEP_S` apart of all stretches, and free runs from row `first` (run,) to before row `end` (run,).
-
-    (row,): `command` [m/s²] as it arrives, mean over the step; `speed` [m/s]; `named` [m/s²], what the car does without
-    free forms, mean over the step; `source`, the row of the drives. `starts` (row,) of stretches. `knots_u`, `knots_v`:
-    where the tables are told. `of_run` (error,): the run of each error.
+    (row,): `command` [m/s²] as it arrives, mean over the step; `speed` [m/s]; `source`, the row of the drives; `starts`
+    of stretches. `knots_u`, `knots_v`: where the tables are told.
     """
 
     dt: float
     command: FloatArray
     speed: FloatArray
-    named: FloatArray
     source: IntArray
     starts: BoolArray
     knots_u: FloatArray
     knots_v: FloatArray
-    first: IntArray
-    end: IntArray
-    of_run: IntArray = field(repr=False)
 
-    @classmethod
-    def of(
-        cls,
-        dt: float,
-        command: FloatArray,
-        speed: FloatArray,
-        named: FloatArray,
-        source: IntArray,
-        starts: BoolArray,
-        knots_u: FloatArray,
-        knots_v: FloatArray,
-        edges: IntArray | None = None,
-    ) -> Runs:
-        """Begun every second of each stretch, or more rarely in long drives; none goes beyond one of `edges` (edge,),
-        rows that are the stretches' own starts and may be more."""
-        begins = np.append(np.flatnonzero(starts), len(speed))
-        every = max(1, round(_EVERY_S / dt), int(np.ceil(len(speed) / _MOST_RUNS)))
-        shortest, settled = max(2, round(_SHORTEST_S / dt)), round(_SETTLED_S / dt)
-        first, end = [], []
-        for i, j in itertools.pairwise(begins if edges is None else edges):
-            own = np.arange(i + settled if starts[i] else i, j - shortest, every)
-            first.append(own)
-            end.append(np.minimum(own + round(HORIZON_S / dt), j))
-        a, e = np.concatenate(first), np.concatenate(end)
-        count = (e - a - 1) // cls.rows_between(dt)
-        of_run = np.repeat(np.arange(len(a)), count)
-        return cls(dt, command, speed, named, source, starts, knots_u, knots_v, a, e, of_run)
-
-    @staticmethod
-    def rows_between(dt: float) -> int:
+    @property
+    def between(self) -> int:
         """Rows between errors that count."""
-        return max(1, round(_RECORD_S / dt))
+        return max(1, round(_RECORD_S / self.dt))
 
     @property
     def shape(self) -> tuple[int, int]:
+        """Of the table."""
         return len(self.knots_u), len(self.knots_v)
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """Free runs over `rows` from row `first` (run,) to before row `end` (run,).
+
+    `named` (row,) [m/s²]: what the car does without free forms, mean over the step. `of_run` (error,): the run of each
+    error.
+    """
+
+    rows: Rows
+    named: FloatArray = field(repr=False)
+    first: IntArray = field(repr=False)
+    end: IntArray = field(repr=False)
+    of_run: IntArray = field(repr=False)
+
+    @classmethod
+    def of(cls, rows: Rows, named: FloatArray, edges: IntArray | None = None) -> Runs:
+        """Begun every second of each stretch, or more rarely in long drives; none goes beyond one of `edges` (edge,),
+        rows that are the stretches' own starts and may be more."""
+        dt, count = rows.dt, len(rows.speed)
+        begins = np.append(np.flatnonzero(rows.starts), count)
+        every = max(1, round(_EVERY_S / dt), int(np.ceil(count / _MOST_RUNS)))
+        shortest, settled = max(2, round(_SHORTEST_S / dt)), round(_SETTLED_S / dt)
+        first, end = [], []
+        for i, j in itertools.pairwise(begins if edges is None else edges):
+            own = np.arange(i + settled if rows.starts[i] else i, j - shortest, every)
+            first.append(own)
+            end.append(np.minimum(own + round(HORIZON_S / dt), j))
+        a, e = np.concatenate(first), np.concatenate(end)
+        return cls(rows, named, a, e, np.repeat(np.arange(len(a)), (e - a - 1) // rows.between))
 
     def drive(self, lag: float, at: Coefficients, *, slopes: bool = False) -> tuple[FloatArray, FloatArray]:
         """Errors (error,) [m/s] of all runs and, with `slopes`, their derivatives (error, coefficient)."""
+        rows = self.rows
         return _drive(
-            self.first,
-            self.end,
-            self.rows_between(self.dt),
-            self.dt,
-            lag,
-            self.named,
-            self.command,
-            self.speed,
-            self.starts,
-            self.knots_u,
-            self.knots_v,
-            np.ascontiguousarray(at.table),
-            at.curve,
-            at.gain,
-            len(self.of_run),
-            slopes,
+            *(self.first, self.end, rows.between, rows.dt, lag, self.named, rows.command, rows.speed, rows.starts),
+            *(rows.knots_u, rows.knots_v, np.ascontiguousarray(at.table), at.curve, at.gain),
+            *(len(self.of_run), slopes),
         )
 
 

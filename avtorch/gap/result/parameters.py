@@ -1,25 +1,28 @@
-"""Parameters of a hypothesis under the answer's names, with uncertainty, and the repaired simulator."""
+"""Parameters of a hypothesis under the answer's names, with uncertainty, and the repaired simulator.
+
+A user's random effect is found as the gust or the outliers that it is like, and called by its own name.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
 import torch
 
 from avtorch.arrays import FloatArray
+from avtorch.errors import InputError
 from avtorch.gap.effects import Gust, Outliers, RoadGrade
-from avtorch.gap.engine.average import Weight
+from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.car import effect_values, plant_of
 from avtorch.gap.engine.coordinates import EFFECTS, Coordinate, base_name
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.sample import Draws, sample
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.own_random import OwnRandom
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant, plant
@@ -28,6 +31,77 @@ from avtorch.io.units import GRAVITY
 _DRAWS = 1000
 _FARTHEST = 12.0  # m/s² or m/s³: no car's limit
 _GRID_STEP = 0.07  # standard deviation of the logarithm of what is read from a grid of sizes
+
+_MADE_OF = {
+    "gust": {"force_sd": "sd_mps2", "force_time": "time_constant_s"},
+    "outliers": {"tail_fraction": "fraction", "tail_scale": "scale"},
+}
+"""Parameters of the table's random effects by what they are in `NoiseChange`, the size first."""
+_OF_TABLE = ("gust", "outliers", "command_hold", "road_grade")
+
+
+@dataclass(frozen=True)
+class OwnRandom:
+    """The class `kind` stands in the place of `like`, "gust" or "outliers"; `parameters` maps that one's names to
+    its."""
+
+    kind: type[Effect]
+    like: str
+    parameters: Mapping[str, str]
+
+
+def own_random(kinds: Sequence[type[Effect]]) -> list[OwnRandom]:
+    """Those of `kinds` that are random and not the table's.
+
+    Raises `InputError` for one that changes neither the force nor the tails of the noise.
+    """
+    out = []
+    for kind in kinds:
+        if not kind.random or (kind.name in _OF_TABLE and TABLE.get(kind.name) is kind):
+            continue
+        typical = kind(**{p.name: float(p.typical()) for p in kind.parameters})
+        change = typical.noise(torch.zeros(8, dtype=torch.float64))
+        like = next((k for k, v in _MADE_OF.items() if change and getattr(change, next(iter(v))) is not None), None)
+        if like is None:
+            raise InputError(
+                f"{kind.name}: found a random effect whose noise is neither a force nor tails, needs one of the two"
+            )
+        values = {p.name: float(torch.as_tensor(getattr(typical, p.name))) for p in kind.parameters}
+        names = {}
+        for field, own in _MADE_OF[like].items():
+            given = getattr(change, field)
+            same = [n for n, x in values.items() if given is not None and abs(x - float(given)) <= 1e-9 * abs(x)]
+            if same:
+                names[own] = same[0]
+        out.append(OwnRandom(kind, like, names))
+    return out
+
+
+def renamed(average: ModelAverage, own: Sequence[OwnRandom], names: Collection[str]) -> ModelAverage:
+    """The average in which what each stands for has its name, too, or its name alone where `names` lack the other."""
+    for each in own:
+        keeps = each.like in names
+        chances: dict[str, float] = {}
+        best: dict[str, Weight] = {}
+        for label, p in average.probabilities.items():
+            parts = label.split("+")
+            if each.like not in parts:
+                chances[label] = chances.get(label, 0.0) + p
+                continue
+            new = "+".join(sorted(each.kind.name if n == each.like else n for n in parts))
+            chances[new] = chances.get(new, 0.0) + (0.5 * p if keeps else p)
+            if keeps:
+                chances[label] = 0.5 * p
+        for label, w in average.best.items():
+            parts = label.split("+")
+            if each.like in parts:
+                new = "+".join(sorted(each.kind.name if n == each.like else n for n in parts))
+                best[new] = replace(w, label=new)
+            if each.like not in parts or keeps:
+                best[label] = w
+        ordered = dict(sorted(chances.items(), key=lambda kv: -kv[1]))
+        average = replace(average, probabilities=ordered, best=best)
+    return average
 
 
 class ParameterPosterior:
@@ -180,19 +254,6 @@ def _within_reach(c: Coordinate, z: float) -> float:
     """The parameter at coordinate `z`; a limit that no command of the drive comes near is told as far out as may be."""
     value = c.value(z)
     return value if math.isfinite(value) else math.copysign(_FARTHEST, value)
-
-
-def table_quantities(h: Hypothesis, effect: str, seed: int = 0) -> dict[str, Quantity]:
-    """Parameters of one effect of a fitted hypothesis by the table's names."""
-    draws = sample(h, chains=1, draws=_DRAWS, seed=seed, method="laplace")
-    name = next(e for e in h.effects if base_name(e) == effect)
-    given = effect_values(h, name)
-    for c in EFFECTS[name].coordinates:
-        given[c.parameter] = torch.as_tensor([c.value(x) for x in draws[c.name].reshape(-1).tolist()])
-    kind = EFFECTS[name].kind or TABLE[effect]
-    shown = kind(**{f.name: given[f.name] for f in fields(kind) if f.name in given})
-    lag = torch.as_tensor(draws["T_L"].reshape(-1).copy())
-    return {key: Quantity.of_draws(x) for key, x in shown.report(lag).items()}
 
 
 def road_along(h: Hypothesis, road: RoadGrade) -> RoadGrade:

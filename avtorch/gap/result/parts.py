@@ -14,14 +14,13 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.answer.budget import LIKELY
-from avtorch.gap.answer.verdict import LEAST_LISTED
 from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.coordinates import EFFECTS, base_name
 from avtorch.gap.engine.force_map import CURVES, ForceMap
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.priors import TEMPER
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.hypotheses import part_probability
+from avtorch.gap.result.hypotheses import LEAST_LISTED, part_probability
 from avtorch.gap.result.parameters import ParameterPosterior
 from avtorch.io.units import GRAVITY
 
@@ -152,8 +151,7 @@ def _size(posterior: ParameterPosterior, name: str) -> Quantity | None:
     if name == "gust" and "sd_mps2" in own:
         return own["sd_mps2"]
     if name == "road_grade" and "grade_rms" in own:
-        q = own["grade_rms"]
-        return Quantity(*(GRAVITY * x for x in (q.mean, q.sd, q.q05, q.q95)))
+        return own["grade_rms"].scaled(GRAVITY)
     effect = next((e for e in h.effects if base_name(e) == name), None)
     if effect is None:
         return None

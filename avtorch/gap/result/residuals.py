@@ -58,8 +58,7 @@ class Residuals:
     @classmethod
     def of(cls, traces: Traces) -> Residuals:
         """The residuals of a diagnosis' traces."""
-        inside = np.diff(traces.stretch) == 0
-        step = float(np.median(np.diff(traces.time)[inside])) if inside.any() else 0.05
+        step = traces.step
         k = traces.channels.index("accel") if "accel" in traces.channels else 0
         channel = traces.channels[k]
         errors = [traces.measured[k] - x[k] for x in (traces.before, traces.after)]

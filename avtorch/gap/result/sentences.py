@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
-from avtorch.gap.answer.budget import Budget
-from avtorch.gap.answer.location import Location
-from avtorch.gap.answer.scope import Scope
-from avtorch.gap.answer.shrinkage import Shrinkage
-from avtorch.gap.answer.verdict import Candidate, Verdict, meanings
-from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.free_form import FreeForm
-from avtorch.gap.result.gap_size import GapSize
-from avtorch.gap.result.log_facts import LogFacts
-from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
-from avtorch.gap.simulator.cause_words import named_cause
+from avtorch.gap.answer.budget import listing
+from avtorch.gap.simulator.effect import EFFECTS, named_cause
 from avtorch.io.clock import clock_words
+
+if TYPE_CHECKING:
+    from avtorch.gap.result.diagnosis import Diagnosis
+    from avtorch.gap.result.hypotheses import Scope
 
 SURE = 0.9
 """Probability from which a headline is unqualified."""
@@ -30,48 +24,7 @@ _MEASURES = {
 }
 
 
-class Findings(Protocol):
-    """The input of the sentences; a `Diagnosis` has it."""
-
-    @property
-    def log(self) -> LogFacts: ...
-    @property
-    def baseline(self) -> Mapping[str, Quantity]: ...
-    @property
-    def gap(self) -> GapSize: ...
-    @property
-    def budget(self) -> Budget | None: ...
-    @property
-    def verdict(self) -> Verdict: ...
-    @property
-    def winner(self) -> Candidate: ...
-    @property
-    def onset_s(self) -> float | None: ...
-    @property
-    def onset_from_start_s(self) -> float | None: ...
-    @property
-    def onset_log(self) -> int: ...
-    @property
-    def where(self) -> tuple[Location, ...]: ...
-    @property
-    def shrinkage(self) -> Shrinkage | None: ...
-    @property
-    def remaining(self) -> tuple[Candidate, ...] | None: ...
-    @property
-    def next_experiment(self) -> Mapping[str, Any] | None: ...
-    @property
-    def setting(self) -> Mapping[str, Any] | None: ...
-    @property
-    def complete(self) -> bool: ...
-    @property
-    def scope(self) -> Scope | None: ...
-    @property
-    def tested(self) -> SimulatorUnderTest | None: ...
-    @property
-    def free_form(self) -> FreeForm | None: ...
-
-
-def headline(found: Findings) -> str:
+def headline(found: Diagnosis) -> str:
     """The verdict as one sentence; provisional where the budget ended the search.
 
     It states an implausible fit; the winner's `implausible` gives the reasons.
@@ -79,7 +32,7 @@ def headline(found: Findings) -> str:
     return _verdict(found) if found.complete else f"Provisional: {_verdict(found)}"
 
 
-def _verdict(found: Findings) -> str:
+def _verdict(found: Diagnosis) -> str:
     verdict, p = found.verdict, _share(found.winner.probability)
     if verdict.abstained and found.winner.probability < 0.5:
         return f"No cause can be named: perhaps it is not among the {_known(found)} ({p}), perhaps too weak to tell."
@@ -105,7 +58,7 @@ def _verdict(found: Findings) -> str:
     return _lacks(found, p)
 
 
-def _lacks(found: Findings, p: str) -> str:
+def _lacks(found: Diagnosis, p: str) -> str:
     """That the simulator lacks the verdict's effects, `p` as words."""
     verdict, winner = found.verdict, found.winner
     who = "The" if winner.probability >= SURE else "Probably the" if winner.probability >= 0.5 else "Perhaps the"
@@ -114,12 +67,12 @@ def _lacks(found: Findings, p: str) -> str:
         return f"{who} simulator lacks {names} ({p}), but as fitted that is physically implausible."
     causes = [_cause(found, name) for name in verdict.names]
     if any(words == name for name, words in zip(verdict.names, causes, strict=True)):
-        meaning = meanings(verdict.name)
+        meaning = ", and ".join(EFFECTS[n].meaning for n in sorted(verdict.names) if n in EFFECTS)
         return f"{who} simulator lacks {names} ({p}){f': {meaning}' if meaning else ''}."
     return f"{who} simulator lacks this ({p}): {', and '.join(causes)}."
 
 
-def _cause(found: Findings, name: str) -> str:
+def _cause(found: Diagnosis, name: str) -> str:
     """One of the verdict's effects in words, at the parameters of the budget or else of the fit."""
     parts = [] if found.budget is None else [*found.budget.parts, *found.budget.chance]
     of_budget = next((part.parameters for part in parts if part.name == name), None)
@@ -131,7 +84,7 @@ def _cause(found: Findings, name: str) -> str:
     return named_cause(name, {key: q.mean for key, q in (of_budget or fitted).items()})
 
 
-def tested(found: Findings) -> list[str]:
+def tested(found: Diagnosis) -> list[str]:
     """What is said of a simulator that is not avtorch's own, beyond the headline."""
     facts = found.tested
     if facts is None:
@@ -158,7 +111,7 @@ def tested(found: Findings) -> list[str]:
     return lines
 
 
-def budget(found: Findings) -> list[str]:
+def budget(found: Diagnosis) -> list[str]:
     """The sentence on the budget of the gap, and what it divides."""
     if found.budget is None or not found.budget.parts:
         return []
@@ -182,7 +135,7 @@ def budget(found: Findings) -> list[str]:
     ]
 
 
-def onset(found: Findings) -> list[str]:
+def onset(found: Diagnosis) -> list[str]:
     """The sentence on the onset; with several causes one for each that sets in during the drive."""
     late = [] if found.budget is None else [p for p in found.budget.parts if p.onset_s is not None]
     if late and found.onset_s is None:
@@ -193,7 +146,7 @@ def onset(found: Findings) -> list[str]:
     return ["The gap is there from the start."] if found.winner.effects else []
 
 
-def moment(found: Findings) -> str:
+def moment(found: Diagnosis) -> str:
     """The onset from the log's start, and in brackets on the log's own clock; one figure where both are the same."""
     assert found.onset_s is not None
     assert found.onset_from_start_s is not None
@@ -203,7 +156,7 @@ def moment(found: Findings) -> str:
     return f"{found.onset_from_start_s:.1f} s from {of} start ({clock_words(round(found.onset_s, 1))})"
 
 
-def where(found: Findings) -> list[str]:
+def where(found: Diagnosis) -> list[str]:
     """Where the gap lies, apart from an onset."""
     places = []
     for part in found.where:
@@ -213,18 +166,14 @@ def where(found: Findings) -> list[str]:
     return [f"The gap lies {', '.join(places)}."] if places else []
 
 
-def shrinkage(found: Findings) -> list[str]:
+def shrinkage(found: Diagnosis) -> list[str]:
     """How far the gap shrinks on held-out data; no second time where the budget's sentence has said so."""
     scores = found.shrinkage
     if scores is None:
         return []
     if budget(found):
-        chosen = scores.chosen
-        return [] if chosen in (1, None) else [f"{100 * chosen:.0f} % of the fits without a part select the same."]
-    top, few = (
-        scores.top,
-        "" if scores.chosen in (1, None) else f"; {100 * scores.chosen:.0f} % of the folds selected it",
-    )
+        return []
+    top = scores.top
     parts = "drives" if scores.by_drives else "blocks"
     effect, it, closes = ("effects", "them", "close") if len(found.verdict.names) > 1 else ("effect", "it", "closes")
     if scores.metric in _MEASURES:
@@ -237,13 +186,13 @@ def shrinkage(found: Findings) -> list[str]:
         density = f"log predictive density {gain:+.2g} nats per row with the {effect}"
         line = f"On held-out {parts}: {density}; rollouts do not show it"
     if top.closed is None:
-        return [f"{line}; almost none of the gap is reducible{few}."]
+        return [f"{line}; almost none of the gap is reducible."]
     q = top.closed
     share = f"{100 * q.mean:.0f} % ({100 * q.q05:.0f} to {100 * q.q95:.0f})"
-    return [f"{line}; the {effect} {closes} {share} of the reducible gap{few}."]
+    return [f"{line}; the {effect} {closes} {share} of the reducible gap."]
 
 
-def moved(found: Findings) -> list[str]:
+def moved(found: Diagnosis) -> list[str]:
     """The change of the baseline's fit by the effect."""
     baseline, with_it, changes = found.baseline, found.winner.moved, []
     for name in ("T_L", "K_L"):
@@ -254,7 +203,7 @@ def moved(found: Findings) -> list[str]:
     return [f"Baseline fitted without and with the {effects}: {', '.join(changes)}."] if changes else []
 
 
-def aliases(found: Findings) -> str:
+def aliases(found: Diagnosis) -> str:
     """The hypotheses that the log cannot distinguish from the verdict."""
     from_words = {"none": "no effect at all", "unknown": "a cause outside the table"}
     if found.budget is not None and len(found.verdict.names) > 2:
@@ -272,9 +221,9 @@ def aliases(found: Findings) -> str:
         return f"No {'' if found.verdict.name == 'none' else 'other '}{which} explains this log as well."
     if len(others) > _ALIASES + 1:
         others = [*others[:_ALIASES], f"any of {len(others) - _ALIASES} less probable hypotheses"]
-    listing = others[0] if len(others) == 1 else f"{', '.join(others[:-1])} or {others[-1]}"
+    alike = others[0] if len(others) == 1 else f"{', '.join(others[:-1])} or {others[-1]}"
     name = from_words.get(found.verdict.name, found.verdict.name.replace("+", " with "))
-    return f"This log cannot distinguish {name} from {listing}."
+    return f"This log cannot distinguish {name} from {alike}."
 
 
 def untried(scope: Scope) -> list[str]:
@@ -284,20 +233,19 @@ def untried(scope: Scope) -> list[str]:
     parts += {"some": ["some of the pairs"], "none": ["pairs"]}.get(scope.pairs, [])
     if not parts:
         return []
-    listing = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
-    return [f"Not tried: {listing}. Probabilities cover only what was tried; unknown stands for the rest."]
+    return [f"Not tried: {listing(parts)}. Probabilities cover only what was tried; unknown stands for the rest."]
 
 
-def _cut(found: Findings) -> bool:
+def _cut(found: Diagnosis) -> bool:
     """Whether single effects were not tried."""
     return found.scope is not None and bool(found.scope.not_scored)
 
 
-def _all_tried(found: Findings) -> bool:
+def _all_tried(found: Diagnosis) -> bool:
     return found.complete and (found.scope is None or found.scope.whole)
 
 
-def _known(found: Findings) -> str:
+def _known(found: Diagnosis) -> str:
     """The set of effects that the sentence excludes."""
     if found.scope is None or _all_tried(found):
         return "effects known here"
@@ -307,7 +255,7 @@ def _known(found: Findings) -> str:
     return f"{which} tried, {len(found.scope.scored)} of {len(found.scope.scored + found.scope.not_scored)}"
 
 
-def gap(found: Findings) -> list[str]:
+def gap(found: Diagnosis) -> list[str]:
     """The rollout errors of the baseline simulator."""
     gap = found.gap
     parts = []
@@ -334,16 +282,16 @@ def number(p: float) -> str:
     return "<.001" if 0 < p < 0.0005 else ">.999" if 0.9995 <= p < 1 else f"{p:.3f}"
 
 
-def remains(found: Findings) -> list[str]:
+def remains(found: Diagnosis) -> list[str]:
     """Hypotheses for what the simulator lacks besides the delay."""
     if not found.remaining:
         return []
     best = sorted(found.remaining, key=lambda c: -c.probability)[:3]
-    listing = ", ".join(f"{c.name} {number(c.probability)}" for c in best if c.probability >= 0.005)
-    return [f"Hypotheses once the simulator has dead_time: {listing}."]
+    each = ", ".join(f"{c.name} {number(c.probability)}" for c in best if c.probability >= 0.005)
+    return [f"Hypotheses once the simulator has dead_time: {each}."]
 
 
-def to_set(found: Findings) -> list[str]:
+def to_set(found: Diagnosis) -> list[str]:
     """The recommended setting."""
     if found.setting is None:
         return []
@@ -351,7 +299,7 @@ def to_set(found: Findings) -> list[str]:
     return [why if why.startswith("Nothing to set") else f"To set: {why}"]
 
 
-def to_drive(found: Findings) -> list[str]:
+def to_drive(found: Diagnosis) -> list[str]:
     """The recommended next experiment."""
     experiment = found.next_experiment
     if experiment is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from avtorch.gap.quantity import Quantity, unit_of, words_of
@@ -48,13 +48,7 @@ class ParameterDifference:
         return f"{words} {own}{unit}, on the car {mean}{unit} ({low} to {high})"
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            "name": self.name,
-            "simulator": self.simulator,
-            "car": self.car.to_dict(),
-            "differs": self.differs,
-            "own": self.own,
-        }
+        return asdict(self)
 
 
 @dataclass(frozen=True)

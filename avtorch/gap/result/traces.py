@@ -32,6 +32,17 @@ class Traces:
     uncounted: tuple[Uncounted, ...] = field(default=(), repr=False)
 
     @property
+    def step(self) -> float:
+        """Time between rows [s]."""
+        inside = np.diff(self.stretch) == 0
+        return float(np.median(np.diff(self.time)[inside])) if inside.any() else 0.05
+
+    @property
+    def stretches(self) -> list[IntArray]:
+        """Rows of each stretch without gaps."""
+        return np.split(np.arange(len(self.time)), np.flatnonzero(np.diff(self.stretch)) + 1)
+
+    @property
     def speed(self) -> FloatArray | None:
         """Measured speed, (row,); None where it was not measured."""
         return self.measured[self.channels.index("speed")] if "speed" in self.channels else None

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from avtorch.gap.counted import Counted
+from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.io import Log
 
 Reason = Literal["driver", "standstill", "gap", "settling"]
@@ -31,7 +31,7 @@ class Uncounted:
     log: int = 0
 
 
-def uncounted(logs: Sequence[Log], record: Counted) -> tuple[Uncounted, ...]:
+def uncounted(logs: Sequence[Log], record: CountedRows) -> tuple[Uncounted, ...]:
     """What `record`, made of these `logs`, does not count, in order of time."""
     found: list[Uncounted] = []
     for number, counted in enumerate(np.unique(record.log[record.source]).tolist()):

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.nonlinear_recursion import solve
-from avtorch.gap.simulator.rate_limited import by_rows, limited_row, slewed_row
+from avtorch.gap.simulator.rate_limited import by_rows
 from avtorch.gap.simulator.recursion import scan, scan_pair
 from avtorch.vehicle.glvd import motion_coefficients
 
@@ -88,7 +88,7 @@ class Actuator:
             return before, slope
 
         # row by row without derivatives; one Newton iteration then supplies them
-        rows = by_rows(limited_row, accel0, parts, jerk)
+        rows = by_rows(accel0, parts, jerk)
         a = _joined(accel0, rows if torch.is_inference_mode_enabled() else solve(step, accel0, rows))
         at, gained = a[..., :-1], torch.zeros_like(a[..., 1:])
         for part in parts:
@@ -215,7 +215,7 @@ def _slewed_over(accel0: Tensor, parts: list[Substep], jerk: Tensor) -> list[Sub
             slope = slope * own
         return before, slope
 
-    rows = by_rows(slewed_row, accel0, parts, jerk)
+    rows = by_rows(accel0, parts, jerk, slews=True)
     ends = _joined(accel0, rows if torch.is_inference_mode_enabled() else solve(step, accel0, rows))
     at, out = ends[..., :-1], []
     for part in parts:

@@ -11,34 +11,19 @@ command → actuator → body → sensor, and its one hook means there:
 | sensor   | acceleration of the car [m/s²]       | acceleration shown [m/s²]                                 |
 
 Without memory the hook is `apply(x, row)`, and one definition serves both a single step of a simulation and a whole
-drive: only the shapes differ. With memory (`memory = True`) it is `start` and `advance`, one row at a time, and `over`,
-a whole drive. Without `over` the rows are looped over, which is correct but slow.
+drive: only the shapes differ. With memory it is `start` and `advance`, one row at a time, and `over`, a whole drive.
+Without `over` the rows are looped over, which is correct but slow.
 
-An effect also declares what the rest of the package needs to know of it, so that no file outside `effects/` names one.
-The defaults suit an ordinary effect:
-
-| used by                 | declared by                                            | default                         |
-|-------------------------|--------------------------------------------------------|---------------------------------|
-| search: initial values  | `starts`                                               | typical sizes                   |
-| search: onset           | `own_onset`; `values_after_onset`                      | any row is tried                |
-| search: randomness      | `noise`; `noise_parameters`, `in_noise`                | a law like one of the table     |
-| experiments             | `integrated.Integrated`                                | nothing is unknown along a road |
-| actuator                | `actuator_parameters`                                  | first order, no rate limit      |
-| aliases: which          | `alias`, `aliased`, `constant_accel`, `force_sign`     | no equivalent effect            |
-| aliases: in combination | `slow_force`, `commutes`                               | its force follows the command   |
-| cross-validation        | `of_the_drive`                                         | parameters are the car's        |
-| linearisation           | `linear`, `one_sided`                                  | proportional to the command     |
-| delay                   | `shift`, `role`                                        | none                            |
-| answers in words        | `in_words`                                             | its name                        |
-| exports, plots          | `accel_limits`, `export_loss`, `pictured`                | not exported; plotted at 12 m/s |
+That, a name, an equation and parameters with units and priors are all that an effect needs. What it may bring besides
+is listed at `Effect`. What can be computed from its response is not declared: `effect_response`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
-from types import MappingProxyType
 from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import torch
@@ -52,8 +37,6 @@ from avtorch.vehicle.arguments import Number, tensor
 from avtorch.vehicle.broadcasting import broadcast
 
 Place = Literal["command", "actuator", "body", "sensor"]
-Alias = Literal["offset", "pole", "K_L"]
-"""The effect's equivalent in the measured acceleration: a constant, one more real pole, or a factor."""
 PLACES: tuple[Place, ...] = ("command", "actuator", "body", "sensor")
 """Places in the chain, in its order.
 
@@ -62,14 +45,6 @@ Example:
     >>> {place: sum(effect.place == place for effect in EFFECTS.values()) for place in PLACES}
     {'command': 5, 'actuator': 7, 'body': 6, 'sensor': 4}
 """
-
-V = TypeVar("V")
-
-
-def fixed(**values: V) -> Mapping[str, V]:
-    """`values` by name, read-only, for a class attribute that cannot be changed by mistake."""
-    return MappingProxyType(values)
-
 
 _LARGEST = 1e12  # limit for a number in a text without a declared domain
 _NAME = 60  # most characters of a name that may be a mistyped effect
@@ -111,22 +86,8 @@ class Effect:
     parameter [s], if there is one, by which it delays commands and does nothing else. `settings`: valid values in a
     text for fields that are not parameters; a field without a domain takes any single finite number.
 
-    Search. `starts`: initial values of some parameters, tried in all combinations and then one at a time. `own_onset`:
-    the parameter [s] that is its onset; no other onset is tried. `of_the_drive`: its parameters belong to a drive and
-    not to the car, so it is no placebo in a cross-validation.
-
-    Randomness. `noise_parameters`: its parameters by their names in `NoiseChange` (`force_sd` and `force_time`,
-    `tail_fraction` and `tail_scale`), or `loss`.
-
-    Aliases, where the log has no speed. `alias`: effects with the same value respond alike, as far as `aliased` and
-    `force_sign` allow; one with `"K_L"` is not observable there. `force_sign`: the only possible sign of its force, 0:
-    either. `slow_force`: its force does not follow the command, so a speed-dependent force may be mistaken for it.
-    `commutes`: its position among two poles in series makes no difference.
-
-    Elsewhere. `linear` False: the step response is not proportional to the step. `one_sided`: it differs between
-    driving and braking. `role`: `"delay"` for the effect that serves as a bare delay wherever one is needed.
-    `export_loss`: what an export to other tools cannot express about this effect. `pictured`: speed [m/s] at which it
-    is visible.
+    `own_onset`: the parameter [s] that is its onset; no other onset is tried. `of_the_drive`: its parameters belong to
+    a drive and not to the car. `memory`, `random`: whether it has `advance` and `noise`, which need not be said.
 
     Example:
         >>> from dataclasses import dataclass
@@ -149,26 +110,18 @@ class Effect:
     parameters: ClassVar[tuple[Parameter, ...]]
     settings: ClassVar[tuple[Domain, ...]] = ()
     order: ClassVar[int] = 0
-    memory: ClassVar[bool] = False
-    random: ClassVar[bool] = False
     needs_speed: ClassVar[bool] = False
     gravity: ClassVar[bool] = False
     derived: ClassVar[tuple[Parameter, ...]] = ()
     shift: ClassVar[str | None] = None
-
-    starts: ClassVar[Mapping[str, tuple[float, ...]]] = fixed()
     own_onset: ClassVar[str | None] = None
     of_the_drive: ClassVar[bool] = False
-    noise_parameters: ClassVar[Mapping[str, str]] = fixed()
-    alias: ClassVar[Alias | None] = None
-    force_sign: ClassVar[Literal[-1, 0, 1]] = 0
-    slow_force: ClassVar[bool] = False
-    commutes: ClassVar[bool] = False
-    linear: ClassVar[bool] = True
-    one_sided: ClassVar[bool] = False
-    role: ClassVar[Literal["delay"] | None] = None
-    export_loss: ClassVar[str] = ""
-    pictured: ClassVar[float] = 12.0
+    memory: ClassVar[bool] = False
+    random: ClassVar[bool] = False
+
+    def __init_subclass__(cls) -> None:
+        cls.memory = cls.memory or cls.advance is not Effect.advance
+        cls.random = cls.random or cls.noise is not Effect.noise
 
     # the hook ------------------------------------------------------------------------------------------------------
     def apply(self, x: Tensor, row: EffectContext) -> Any:
@@ -218,37 +171,13 @@ class Effect:
         no limit; None: neither."""
         return None
 
-    def values_after_onset(self) -> Mapping[str, float]:
-        """Parameter values at which any change during a drive is long past."""
-        return {}
-
-    @classmethod
-    def aliased(cls, values: Mapping[str, float]) -> bool:
-        """Whether it responds as its `alias` states, at these `values` of its parameters and of `T_L` [s]."""
-        return True
-
-    @classmethod
-    def constant_accel(cls, values: Mapping[str, float] | None) -> float | None:
-        """The constant [m/s²] that it adds to the measured acceleration, at `values` of its parameters (None: unknown).
-
-        Where they are unknown, any number of the only possible sign. None where it is not known to be constant.
-        """
-        return None
-
     @classmethod
     def in_words(cls, values: Mapping[str, float]) -> str:
-        """What it does to the car, as a clause, at `values` of its parameters under the answer's names."""
-        return cls.meaning
+        """What it does to the car, as a clause, at `values` of its parameters under the answer's names.
 
-    @classmethod
-    def alike(cls, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Names of effects that no log tells from it, at `values` of its parameters under the answer's names."""
-        return ()
-
-    @classmethod
-    def brings_words(cls) -> bool:
-        """Whether it has a clause of its own; else it is called by its name."""
-        return cls.in_words.__func__ is not Effect.in_words.__func__
+        Empty for an effect that is called by its name.
+        """
+        return ""
 
     def coordinates(self) -> tuple[Parameter, ...]:
         """The parameters of a fit: `parameters`, unless settings of this instance affect them."""
@@ -358,12 +287,74 @@ def effect_class(name: str, more: Iterable[type[Effect]] = ()) -> type[Effect]:
     return known[name]
 
 
+def candidate_name(names: str | Iterable[str]) -> str:
+    """The canonical name of a hypothesis: its effects in alphabetical order, joined by `+`."""
+    return "+".join(sorted(names.split("+") if isinstance(names, str) else names))
+
+
+def chosen_effects(effects: Sequence[str | type[Effect]] | None) -> list[type[Effect]]:
+    """The classes of `effects` that a caller asks for, by name or class; all registered ones where it is None.
+
+    Raises `InputError` for a single name in place of a list, for anything that is no effect, and for one given twice.
+    """
+    if effects is None:
+        return list(EFFECTS.values())
+    if isinstance(effects, str):
+        raise InputError(f"effects: found {quoted(effects)}, needs a list of names or classes")
+    kinds: list[type[Effect]] = []
+    given: list[object] = list(effects)
+    for effect in given:
+        kind = effect_class(effect) if isinstance(effect, str) else effect
+        if not (isinstance(kind, type) and issubclass(kind, Effect)):
+            raise InputError(f"effects: found {quoted(repr(effect))}, needs names or classes of effects")
+        if kind in kinds:
+            raise InputError(f"effects: found {kind.name} twice, needs each effect once")
+        kinds.append(kind)
+    return kinds
+
+
 def delay_effect() -> type[Effect]:
-    """The effect that serves as a bare delay: the first one registered with that role."""
-    return next(cls for cls in EFFECTS.values() if cls.role == "delay")
+    """The effect that serves as a bare delay: the first one registered that does nothing else."""
+    return next(cls for cls in EFFECTS.values() if cls.shift is not None)
 
 
 def delay_key() -> str:
     """The key of that delay [s] among a plant's parameters."""
     kind = delay_effect()
     return f"{kind.name}.{kind.shift}"
+
+
+def cause_words(name: str, values: Mapping[str, float]) -> str:
+    """What the effect called `name` does to the car, at `values` of its parameters under the answer's names.
+
+    Its general meaning where a value is not known; empty where it brings no sentence or is not registered.
+
+    Example:
+        >>> from avtorch.gap.simulator.effect import cause_words
+        >>> cause_words("brake_throttle_asymmetry", {"brake_gain_ratio": 0.7, "brake_lag_ratio": 1.0})
+        'the brake is weaker than the throttle'
+        >>> cause_words("dead_time", {}), cause_words("trailer", {"mass_ratio": 0.4})
+        ('the command acts after a delay', '')
+    """
+    kind = EFFECTS.get(name)
+    if kind is None or kind.in_words.__func__ is Effect.in_words.__func__:
+        return ""
+    needed = [p.name for p in (kind.derived or kind.parameters) if p.reported]
+    if any(math.isnan(values.get(key, math.nan)) for key in needed):
+        return kind.meaning
+    return kind.in_words(values)
+
+
+def named_cause(name: str, values: Mapping[str, float], behind: str = "") -> str:
+    """The cause in words, in brackets its name and what is said `behind` it; the name alone where there are no words.
+
+    Example:
+        >>> from avtorch.gap.simulator.effect import named_cause
+        >>> named_cause("dead_time", {"delay_s": 0.21}, "62 % of the gap")
+        'commands act 0.21 s late (dead_time, 62 % of the gap)'
+        >>> named_cause("trailer", {}, "62 % of the gap"), named_cause("trailer", {})
+        ('trailer (62 % of the gap)', 'trailer')
+    """
+    words = cause_words(name, values)
+    inside = ", ".join(x for x in (name if words else "", behind) if x)
+    return f"{words or name} ({inside})" if inside else name

@@ -65,7 +65,6 @@ class ForceTable(Effect):
     place = "command"
     order = 10  # behind a dead time: the speed is that of the moment
     needs_speed = True
-    linear = False
     meaning = "the force is a map of command and speed"
     equation = "K_L u + F(u, v)"
     parameters = ()
@@ -117,7 +116,6 @@ class ResistanceCurve(Effect):
     name = "resistance_curve"
     place = "body"
     needs_speed = True
-    slow_force = True
     meaning = "a force that depends on the speed"
     equation = "R(v) while moving"
     parameters = ()

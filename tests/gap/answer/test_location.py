@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avtorch.gap.answer.location import RowAttribution, _q_values, localise, shortest
 from avtorch.gap.drive_record import Record
+from avtorch.gap.result.attribution import RowAttribution, _q_values, localise, shortest
 from tests.bars import BAR
 from tests.gap.records import log_of
 

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from avtorch.errors import InputError
-from avtorch.gap import AerodynamicDrag, DeadTime, GapPlant, Parameter, RoadGrade, Saturation, plant
+from avtorch.gap import AerodynamicDrag, DeadTime, GapPlant, RoadGrade, Saturation, plant
 from avtorch.gap.quantity import unit_of, words_of
 from avtorch.gap.result.diagnosis import (
     Candidate,
@@ -26,11 +26,10 @@ from avtorch.gap.result.diagnosis import (
     Verdict,
     candidate_name,
     listed_candidates,
-    near,
-    verdict_of,
 )
 from avtorch.io import Log
 from tests.faulty_disk import visible
+from tests.gap.verdicts import verdict_of
 
 ROOT = Path(__file__).resolve().parents[3]
 DELAY = {"delay_s": Quantity(0.2, 0.01, 0.18, 0.22)}
@@ -90,21 +89,11 @@ def test_quantity_of_draws() -> None:
     assert Quantity.of_draws(torch.tensor([2.0])) == Quantity(2.0, 0.0, 2.0, 2.0)
 
 
-def test_quantity_of_a_normal_seen_through_a_link() -> None:
-    z = 1.6448536269514722
-    q = Quantity.of_normal(-1.0, 0.7, torch.exp)
-    mean = math.exp(-1 + 0.245)
-    assert q.mean == pytest.approx(mean, rel=1e-12)
-    assert q.sd == pytest.approx(mean * math.sqrt(math.expm1(0.49)), rel=1e-12)
-    assert q.q05 == pytest.approx(math.exp(-1 - 0.7 * z), rel=1e-12)
-    assert q.q95 == pytest.approx(math.exp(-1 + 0.7 * z), rel=1e-12)
-    falling = Quantity.of_normal(0.5, 0.1, lambda x: -x)
-    plain = Quantity.of_normal(-0.5, 0.1)
-    assert falling.to_dict() == pytest.approx(plain.to_dict(), rel=1e-12)
-    uniform = Quantity.of_normal(0.0, 1.0, Parameter("x", "-", None, 10.0, 20.0, "interval").constrain)
-    assert (uniform.q05, uniform.q95) == pytest.approx((10.5, 19.5))
-    assert uniform.mean == pytest.approx(15.0)
-    assert uniform.sd == pytest.approx(10 / math.sqrt(12), rel=1e-3)
+def test_quantity_of_a_normal() -> None:
+    q, z = Quantity.of_normal(-0.5, 0.1), 1.6448536269514722
+    assert (q.mean, q.sd) == (-0.5, 0.1)
+    assert (q.q05, q.q95) == pytest.approx((-0.5 - 0.1 * z, -0.5 + 0.1 * z), rel=1e-12)
+    assert q.scaled(2.0).to_dict() == pytest.approx(Quantity.of_normal(-1.0, 0.2).to_dict())
 
 
 @pytest.mark.parametrize("bad", [(math.nan, 1, 0, 1), (0, -1, 0, 1), (0, 1, 1, 0), (0, math.inf, 0, 1)])
@@ -176,31 +165,6 @@ def test_a_pair_has_one_name() -> None:
         Candidate("gust", 1.5)
     with pytest.raises(InputError, match="needs 0 to 1"):
         Candidate("gust", math.nan)
-
-
-def test_verdict_is_the_most_probable_with_its_aliases() -> None:
-    given = candidates(sensor_lag=0.3, dead_time=0.63, none=0.01, unknown=0.06)
-    verdict = verdict_of(given)
-    assert (verdict.names, verdict.alias_set, verdict.abstained) == (("dead_time",), ("dead_time", "sensor_lag"), False)
-    assert verdict.why == "dead_time has probability 0.63; next likeliest, with 0.3, is sensor_lag."
-    assert verdict_of(given, aliases=near(0.6)).alias_set == ("dead_time",)
-    # a hypothesis without prediction is a rival only where it is about as probable
-    assert verdict_of(given, aliases=near(0.6, unknown=0.05)).alias_set == ("dead_time", "unknown")
-    doubted = candidates(dead_time=0.6, none=0.05, unknown=0.35)
-    assert verdict_of(doubted).alias_set == ("dead_time", "unknown", "none")
-    own = verdict_of(given, aliases=lambda ranked: ["gust+dead_time", "dead_time"], why="Because.")
-    assert own.alias_set == ("dead_time", "dead_time+gust")
-    assert own.why == "Because."
-    pair = verdict_of(candidates(dead_time_and_gust=0.98, none=0.01, unknown=0.01))
-    assert (pair.names, pair.alias_set) == (("dead_time", "gust"), ("dead_time+gust",))
-
-
-@pytest.mark.parametrize("name", ["none", "unknown"])
-def test_verdict_without_a_cause(name: str) -> None:
-    verdict = verdict_of(candidates(**{"dead_time": 0.02, "none": 0.0, "unknown": 0.0, name: 0.98}))
-    assert verdict.names == verdict.alias_set == (name,)
-    assert verdict.abstained == (name == "unknown")
-    assert "next likeliest, with 0.02, is dead_time." in verdict.why
 
 
 # --- the whole

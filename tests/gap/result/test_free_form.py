@@ -14,7 +14,7 @@ from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.result.free_form import FittedForm, Sizes, fitted_form
 from avtorch.gap.result.held_out import HeldOut, Scores
-from avtorch.gap.result.output_error import Coefficients, Runs
+from avtorch.gap.result.output_error import Coefficients, Rows, Runs
 from tests.gap.cars import log_of
 
 MAP = ForceTable((-2.0, 0.0, 2.0), (5.0, 30.0), ((1.0, 0.6), (0.0, 0.0), (-0.2, -1.2)))
@@ -57,7 +57,7 @@ def test_slopes_of_free_runs_are_their_derivatives() -> None:
     starts[[0, 100]] = True
     command, speed = rng.normal(size=n), 10 + np.cumsum(rng.normal(size=n)) * 0.1
     knots = (np.array([-1.0, 0.0, 1.0]), np.array([8.0, 10.0, 12.0]))
-    runs = Runs.of(0.1, command, speed, 0.1 * command, np.arange(n), starts, *knots)
+    runs = Runs.of(Rows(0.1, command, speed, np.arange(n), starts, *knots), 0.1 * command)
     x = 0.3 * rng.normal(size=13)
     _, slopes = runs.drive(0.3, Coefficients.of(x, (3, 3)), slopes=True)
     for k in range(len(x)):
@@ -81,9 +81,7 @@ def test_a_free_form_that_loses_in_the_budgets_runs_is_not_handed_back(named: fl
     """Against names alone, and against the baseline; channels count alike, whatever their units."""
     scale = np.array([[4.0, 4.0], [0.01, 0.03]])  # (channel, block)
     steps = tuple(Scores(x * scale, np.zeros(2)) for x in (1.0, named, free))
-    held = HeldOut(
-        (), cast(Any, None), steps, steps[0], steps[1], steps[0], *np.zeros((4, 1)), horizon_s=10.0, free=True
-    )
+    held = HeldOut((), cast(Any, None), steps, steps[0], steps[1], steps[0], np.zeros(1), horizon_s=10.0, free=True)
     assert held.free_gains == gains
     assert [x.squares[0, 0] for x in held.without_free().steps] == [4.0, 4.0 * named]
     assert not held.without_free().free

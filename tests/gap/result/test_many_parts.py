@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from avtorch.gap import EFFECTS, Budget, ChannelError, Part, Unexplained
-from avtorch.gap.answer.verdict import Candidate, Verdict, candidate_name
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis, GapSize, LogFacts
+from avtorch.gap.result.hypotheses import Candidate, Verdict, candidate_name
 
 NAMES = (
     "sensor_lag",

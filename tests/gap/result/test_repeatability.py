@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from avtorch.gap.answer.verdict import Candidate, Verdict
 from avtorch.gap.drive_record import Record
 from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis, GapSize, LogFacts
-from avtorch.gap.result.repeatability import SETTLED_S, WINDOW_S, Repeatability, repeatability
+from avtorch.gap.result.gap_size import SETTLED_S, WINDOW_S, Repeatability, repeatability
+from avtorch.gap.result.hypotheses import Candidate, Verdict
 from avtorch.io import Log
 from tests.bars import BAR
 

@@ -11,7 +11,7 @@ import pytest
 from avtorch.gap import EFFECTS, DeadTime, Effect, register
 from avtorch.gap.answer.budget import Budget, ChancePart, ChannelError, Part, Unexplained
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.simulator.cause_words import cause_words, named_cause
+from avtorch.gap.simulator.effect import cause_words, named_cause
 
 
 def reported(kind: type[Effect], end: str) -> dict[str, float]:

@@ -9,7 +9,7 @@ import pytest
 import avtorch
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, SensorBias, gap_budget
-from avtorch.gap.simulator.effect_choice import chosen_effects
+from avtorch.gap.simulator.effect import chosen_effects
 from avtorch.io import Log
 from tests.gap.records import log_of
 

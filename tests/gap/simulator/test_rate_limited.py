@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator import actuator, rate_limited
+from avtorch.gap.simulator import actuator
 from avtorch.gap.simulator.actuator import Actuator, ActuatorState, Substep
-from avtorch.gap.simulator.rate_limited import by_rows, limited_row, slewed_row
+from avtorch.gap.simulator.rate_limited import by_rows
 
 D = torch.float64
 ROWS = 60
@@ -49,7 +49,7 @@ def test_rows_are_the_closed_form(batch: tuple[int, ...], count: int, limit: flo
     parts = _parts(batch, g, count)
     start = torch.randn(batch, generator=g, dtype=D)
     jerk = limit * (0.5 + torch.rand(*batch, 1, generator=g, dtype=D))
-    got = by_rows(limited_row, start, parts, jerk)
+    got = by_rows(start, parts, jerk)
     assert got.shape == (*batch, ROWS)
     torch.testing.assert_close(got, _stepped(start, parts, jerk[..., 0]), rtol=0, atol=1e-12)
 
@@ -77,7 +77,7 @@ def test_slewed_rows_are_the_closed_form(fresh_seed: int) -> None:
     g = torch.Generator().manual_seed(fresh_seed)
     parts = _parts((3,), g, 2)
     start, jerk = torch.randn(3, generator=g, dtype=D), torch.full((3, 1), 1.5, dtype=D)
-    got, state = by_rows(slewed_row, start, parts, jerk), start
+    got, state = by_rows(start, parts, jerk, slews=True), start
     for k in range(ROWS):
         for part in parts:
             state = actuator._slewed(state, Substep(part.target[:, k], part.lag[:, 0], part.length[:, k]), jerk[:, 0])[
@@ -92,33 +92,19 @@ def test_shapes_broadcast_and_nothing_is_differentiated() -> None:
     lag = torch.tensor([[0.2], [0.5]], dtype=D, requires_grad=True)
     part = Substep(target, lag, torch.tensor(0.05, dtype=D))
     jerk = torch.tensor([[1.0], [4.0]], dtype=D)
-    got = by_rows(limited_row, torch.zeros((), dtype=D), [part], jerk)
+    got = by_rows(torch.zeros((), dtype=D), [part], jerk)
     assert got.shape == (2, ROWS)
     assert not got.requires_grad
     for i in range(2):
         own = Substep(target, lag[i].detach(), torch.tensor(0.05, dtype=D))
-        alone = by_rows(limited_row, torch.zeros((), dtype=D), [own], jerk[i])
+        alone = by_rows(torch.zeros((), dtype=D), [own], jerk[i])
         torch.testing.assert_close(got[i], alone, rtol=0, atol=1e-14)
-    single = by_rows(limited_row, torch.zeros((), dtype=D), [own], torch.tensor(4.0, dtype=D))
+    single = by_rows(torch.zeros((), dtype=D), [own], torch.tensor(4.0, dtype=D))
     torch.testing.assert_close(single, got[1], rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("limit", [0.05, 0.5, 5.0])
-def test_stretches_side_by_side_are_one_drive(limit: float, fresh_seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where the limit binds for most of the drive and nothing is forgotten."""
-    g = torch.Generator().manual_seed(fresh_seed)
-    rows = 3 * rate_limited._SHORTEST + 17
-    target = torch.cumsum(0.2 * torch.randn(rows, generator=g, dtype=D), 0)
-    length = 0.01 + 0.04 * torch.rand(2, rows, generator=g, dtype=D)
-    part = Substep(target, torch.tensor([[0.2], [1.0]], dtype=D), length)
-    start, jerk = torch.tensor([0.0, 1.0], dtype=D), torch.tensor([[limit], [2 * limit]], dtype=D)
-    got = by_rows(limited_row, start, [part, part], jerk)
-    monkeypatch.setattr(rate_limited, "_SHORTEST", rows)
-    torch.testing.assert_close(got, by_rows(limited_row, start, [part, part], jerk), rtol=0, atol=1e-11)
 
 
 def test_a_limit_that_never_binds_is_the_lag_alone() -> None:
     target, h, lag = torch.ones(ROWS, dtype=D), torch.tensor(0.05, dtype=D), torch.tensor([0.4], dtype=D)
-    got = by_rows(limited_row, torch.zeros((), dtype=D), [Substep(target, lag, h)], torch.tensor(float("inf"), dtype=D))
+    got = by_rows(torch.zeros((), dtype=D), [Substep(target, lag, h)], torch.tensor(float("inf"), dtype=D))
     time = 0.05 * torch.arange(1, ROWS + 1, dtype=D)
     torch.testing.assert_close(got, 1 - torch.exp(-time / 0.4), rtol=0, atol=1e-12)

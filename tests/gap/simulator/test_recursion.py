@@ -67,8 +67,6 @@ def test_pair_is_the_loop(steps: int, constant: bool, compiled: bool, fresh_seed
         torch.testing.assert_close(torch.stack([g[:, k] for g in got]), torch.stack(x), rtol=1e-9, atol=1e-9)
 
 
-# torch scripts its forward-mode formulas at their first use, and deprecates doing so
-@pytest.mark.filterwarnings("ignore:.torch.jit.script:DeprecationWarning")
 @pytest.mark.parametrize("steps", [6, pytest.param(40, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("constant", [False, True])
 def test_derivatives(steps: int, constant: bool) -> None:
@@ -77,23 +75,12 @@ def test_derivatives(steps: int, constant: bool) -> None:
     alpha = torch.rand(2, rows, dtype=D, requires_grad=True)
     beta = torch.randn(2, steps, dtype=D, requires_grad=True)
     start = torch.randn(2, dtype=D, requires_grad=True)
-    assert torch.autograd.gradcheck(scan, (alpha, beta, start), check_forward_ad=True)
+    assert torch.autograd.gradcheck(scan, (alpha, beta, start))
     assert torch.autograd.gradgradcheck(scan, (alpha, beta, start))
     pair = [(0.5 * torch.randn(2, rows, dtype=D)).requires_grad_() for _ in range(4)]
     more = [torch.randn(2, steps, dtype=D, requires_grad=True) for _ in range(2)]
     first = [torch.randn(2, dtype=D, requires_grad=True) for _ in range(2)]
-    assert torch.autograd.gradcheck(
-        lambda *p: scan_pair(p[:4], p[4:6], p[6:]), (*pair, *more, *first), check_forward_ad=True
-    )
-
-
-@pytest.mark.filterwarnings("ignore:.torch.jit.script:DeprecationWarning")
-def test_jacobians_of_torch_func() -> None:
-    def response(log_alpha: torch.Tensor) -> torch.Tensor:
-        return scan(log_alpha.exp().expand(1), torch.ones(50, dtype=D), torch.zeros((), dtype=D))
-
-    at = torch.tensor(-0.1, dtype=D)
-    torch.testing.assert_close(torch.func.jacfwd(response)(at), torch.func.jacrev(response)(at))
+    assert torch.autograd.gradcheck(lambda *p: scan_pair(p[:4], p[4:6], p[6:]), (*pair, *more, *first))
 
 
 def test_newton_is_the_loop() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from avtorch.gap import SensorBias, plant
-from avtorch.gap.answer.given_dead_time import given_dead_time
-from avtorch.gap.answer.verdict import Candidate, verdict_of
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.hypotheses import Candidate, given_dead_time
+from tests.gap.verdicts import verdict_of
 
 HALF = Quantity(0.1, 0.01, 0.08, 0.12)
 RACE = (

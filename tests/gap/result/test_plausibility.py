@@ -12,10 +12,10 @@ import avtorch
 from avtorch.cli.diagnosis_table import diagnosis_headline
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, Effect, Parameter, plant
-from avtorch.gap.answer.plausibility import implausible
 from avtorch.gap.effects import Gust, SensorLag
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.hypotheses import implausible
 from avtorch.gap.simulator.plant import BASELINE
 from avtorch.report import report_html
 from tests.gap.records import Noise, log_of
