@@ -47,7 +47,7 @@ class RunningFmu:
 
     def __init__(self, path: str, source: str, folder: str) -> None:
         try:
-            fmpy, *parts = (importlib.import_module(f"fmpy{part}") for part in ("", ".fmi2", ".fmi3"))
+            fmpy, fmi2, fmi3 = (importlib.import_module(f"fmpy{part}") for part in ("", ".fmi2", ".fmi3"))
         except Exception as fault:
             raise InputError(
                 f"{source}: running an FMU needs fmpy, which cannot be loaded here ({reason(fault)}): "
@@ -64,7 +64,7 @@ class RunningFmu:
                 self._described = fmpy.read_model_description(folder, validate=False)
                 problem = printable(str(fault.problems[0]), 160)
                 self.remarks = (f"modelDescription.xml departs from the standard ({problem})",)
-            self._fmu, self._options = self._loaded(fmpy, *parts, source, folder)
+            self._fmu, self._options = self._loaded(fmpy, fmi2, fmi3, source, folder)
         except InputError:
             raise
         except Exception as fault:
