@@ -32,8 +32,8 @@ import psutil
 
 from avtorch.fleet import FleetSettings, read_rows, run_fleet
 from avtorch.fleet.cluster import Cluster
-from avtorch.fleet.places import content_hash
-from avtorch.fleet.rows import DATASETS
+from avtorch.fleet.folder import DATASETS
+from avtorch.fleet.log_list import content_hash
 from avtorch.fleet.settings import Step
 from avtorch.fleet.task import Task, work
 from avtorch.io import write_json

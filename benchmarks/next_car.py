@@ -3,7 +3,7 @@
 ``python -m benchmarks.next_car [--fleets 200] [--seed 1]``
 
 Each fleet has a cause whose one parameter, in the coordinate of its prior, varies normally between cars; one drive a
-car tells it well (to 0.02). `avtorch.fleet.effect_sizes` pools it as `avtorch fleet` does. Share of the next cars of
+car tells it well (to 0.02). `avtorch.fleet.population` pools it as `avtorch fleet` does. Share of the next cars of
 each fleet that the interval holds, in closed form, mean over fleets.
 """
 
@@ -14,7 +14,7 @@ import argparse
 import torch
 from torch.special import ndtr
 
-from avtorch.fleet.effect_sizes import effect_sizes
+from avtorch.fleet.population import effect_sizes
 from avtorch.gap import EFFECTS
 
 CARS, SPREADS = (3, 6, 20), (0.1, 0.3, 0.5, 1.0)

@@ -35,7 +35,7 @@ from avtorch.io.log import STANDSTILL_MPS
 from avtorch.live import Answer, Batch, Counts, KeptCars, LineParser, LiveSettings, LiveWatch, Row, Stop, watch_source
 from avtorch.live.car import LiveWindow
 from avtorch.live.live_watch import window_answer
-from avtorch.live.sink import line_of
+from avtorch.live.watch_source import line_of
 
 RATE_HZ, PERIOD_S = 100, 0.01
 CHUNK_S, CHUNKS = 2, 10

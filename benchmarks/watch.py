@@ -20,7 +20,7 @@ import torch
 
 from avtorch.live import Answer, Batch, Counts, LineParser, LiveSettings, LiveWatch, Row, Stop, watch_source
 from avtorch.live.car import LiveCar
-from avtorch.live.sink import line_of
+from avtorch.live.watch_source import line_of
 from avtorch.vehicle.glvd import glvd_rollout
 
 RATE_HZ = 100

@@ -17,8 +17,8 @@ import avtorch
 from avtorch import plots
 from avtorch.decision import Setting
 from avtorch.display import show
-from avtorch.external.driven_plant import DrivenPlant
 from avtorch.external.driving import driven_along
+from avtorch.external.simulator import DrivenPlant
 from avtorch.gap import plant
 from avtorch.plots import diagnosis as over_diagnosis
 from avtorch.remedy import setting_for, to_autoware

@@ -8,7 +8,6 @@ import inspect
 import pytest
 from matplotlib.figure import Figure
 
-from avtorch import MPC
 from avtorch.deprecation import renamed
 from avtorch.errors import InputError
 from avtorch.plots import string_probability
@@ -38,14 +37,6 @@ def test_both_are_one_too_many() -> None:
 
 def test_help_shows_the_new_name_alone() -> None:
     assert list(inspect.signature(rows).parameters) == ["logs", "most"]
-
-
-def test_a_constructor_is_called_by_its_class() -> None:
-    with pytest.warns(DeprecationWarning, match=r"^MPC\(T=...\) is deprecated, write T_hat=..."):
-        mpc = MPC(T=0.4)  # type: ignore[call-arg]
-    assert mpc.T_hat == 0.4
-    with pytest.warns(DeprecationWarning, match="write MPC.T_hat"):
-        assert mpc.T == 0.4
 
 
 def test_a_drawing_takes_the_old_name() -> None:

@@ -19,9 +19,7 @@ SKIPPED: dict[str, str] = {}
 # Whole experiments and diagnoses, though small ones: seconds each.
 SLOW = frozenset(
     {
-        "avtorch.experiment.information.information",
         "avtorch.experiment.next_experiment.next_experiment",
-        "avtorch.experiment.prediction.ManoeuvrePrediction",
         "avtorch.external.compare_simulators.compare_simulators",
         "avtorch.external.external_simulator.ExternalSimulator",
         "avtorch.external.fmu.FmuSimulator",
@@ -32,7 +30,6 @@ SLOW = frozenset(
         "avtorch.fleet.run.run_fleet",
         "avtorch.follower.diagnose_follower.FollowerDiagnosis",
         "avtorch.follower.diagnose_follower.diagnose_follower",
-        "avtorch.follower.identify.Identified",
         "avtorch.gap",
         "avtorch.gap.budget.gap_budget",
         "avtorch.gap.answer.budget.Budget",

@@ -16,11 +16,11 @@ from torch import Tensor
 from avtorch.decision.settings import Number, Setting
 from avtorch.errors import InputError
 from avtorch.vehicle.block import Block
+from avtorch.vehicle.controllers import RAMP_RATE
 from avtorch.vehicle.leader import Leader
 from avtorch.vehicle.loop import ClosedLoop
 from avtorch.vehicle.performance import performance
 from avtorch.vehicle.plant import GLVDPlant
-from avtorch.vehicle.time_gap import RAMP_RATE
 
 _ROWS = 4096  # closed loops simulated in one batch: larger batches only cost memory
 

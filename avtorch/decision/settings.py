@@ -18,11 +18,10 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.vehicle import stability
-from avtorch.vehicle.broadcasting import broadcast_shape
-from avtorch.vehicle.controllers import NOMINAL_GAINS, LinearController
+from avtorch.vehicle.arguments import broadcast_shape
+from avtorch.vehicle.controllers import NOMINAL_GAINS, RAMP_RATE, LinearController
 from avtorch.vehicle.lower_level import LowerLevel
 from avtorch.vehicle.stability.conditions import Conditions, Form
-from avtorch.vehicle.time_gap import RAMP_RATE
 
 Number = float | Tensor
 

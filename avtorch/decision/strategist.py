@@ -31,7 +31,7 @@ from avtorch.decision.grid import Candidates, Grid
 from avtorch.decision.replay import History, Prediction, replay
 from avtorch.decision.settings import Number, Setting
 from avtorch.errors import InputError
-from avtorch.vehicle.time_gap import RAMP_RATE
+from avtorch.vehicle.controllers import RAMP_RATE
 
 # Candidates evaluated, and replayed, at a time: with few scenarios a larger batch costs hardly more.
 _EVALUATED = 48

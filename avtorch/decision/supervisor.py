@@ -22,10 +22,9 @@ from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.stream import BeliefStream
 from avtorch.io.log import STANDSTILL_MPS
 from avtorch.vehicle.block import Block
-from avtorch.vehicle.controllers import LinearController
+from avtorch.vehicle.controllers import RAMP_RATE, LinearController
 from avtorch.vehicle.loop import ClosedLoop
 from avtorch.vehicle.plant import GLVDPlant
-from avtorch.vehicle.time_gap import RAMP_RATE
 
 _NEVER = 2**62  # steps
 

@@ -13,10 +13,8 @@ import numpy as np
 from avtorch.display import Card, Displayed
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.experiment.information import Information, information
-from avtorch.experiment.limits import Limits
-from avtorch.experiment.manoeuvres import Manoeuvre, library
-from avtorch.experiment.prediction import ManoeuvrePrediction, responses
+from avtorch.experiment.manoeuvres import Limits, Manoeuvre, library
+from avtorch.experiment.prediction import Information, ManoeuvrePrediction, information, responses
 from avtorch.gap.drive_record import grouped
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.predictive_model import PredictiveModel

@@ -1,4 +1,5 @@
-"""The prediction of each remaining cause for a manoeuvre: a normal distribution of the measured rows.
+"""The prediction of each remaining cause for a manoeuvre, a normal distribution of the measured rows, and how well the
+manoeuvre would distinguish the causes.
 
 Its mean is the rollout at the posterior mean of the parameters, its spread that of rollouts at posterior draws (and at
 draws of the unknown slope); its noise is that of the log. Measurements are compared as a diagnosis compares them, in
@@ -13,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from scipy.special import logsumexp
 
 from avtorch.arrays import FloatArray
 from avtorch.experiment.manoeuvres import Manoeuvre
@@ -70,18 +72,6 @@ class PredictiveLaw:
 class ManoeuvrePrediction:
     """One contender on all manoeuvres: `rollouts` (manoeuvre, draw, channel, row), half of which make the laws and
     half the examples.
-
-    Example:
-        >>> from avtorch import Leader, diagnose, simulate
-        >>> from avtorch.experiment import ManoeuvrePrediction, library
-        >>> from avtorch.gap import DeadTime, plant
-        >>> late = plant([DeadTime(0.4)], sigma=0.0)
-        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
-        >>> cause = diagnose(log, effects=["dead_time"], pairs=False).contenders[0]
-        >>> manoeuvres = library()
-        >>> predicted = ManoeuvrePrediction.of(cause, manoeuvres, ("accel", "speed"), group=1, draws=20)
-        >>> predicted.rollouts.shape == (len(manoeuvres), 20, 2, len(manoeuvres[0].time))
-        True
     """
 
     contender: PredictiveModel
@@ -157,3 +147,40 @@ class ManoeuvrePrediction:
         speed = np.concatenate([np.zeros((len(force), 1)), gained], -1)
         accel = np.zeros_like(force) if self.contender.specific_force else force
         return self.coefficients(np.stack([{"accel": accel, "speed": speed}[name] for name in self.channels], 1))
+
+
+@dataclass(frozen=True)
+class Information:
+    """`nats`: mutual information between the cause and the measurements to come, at most the entropy of the cause.
+
+    `truth_probability`: expected probability of the true cause afterwards. `margin`: median log odds [nats] of the true
+    cause against the likest other one, for the worst pair.
+    """
+
+    nats: float
+    truth_probability: float
+    margin: float
+
+
+def information(
+    predictions: Sequence[ManoeuvrePrediction], number: int, prior: Sequence[float], *, seed: int = 0
+) -> Information:
+    """The information of manoeuvre `number`, from simulated measurements; `prior` has the causes' probabilities.
+
+    Each simulated measurement is scored under the distribution of each cause.
+    """
+    rng = np.random.default_rng([seed, number])
+    laws = [f.law(number) for f in predictions]
+    log_prior = np.log(np.maximum(np.asarray(prior, float) / np.sum(prior), 1e-6))
+    nats, truth_probability, margin = 0.0, 0.0, np.inf
+    for i, one in enumerate(predictions):
+        measured = one.examples(number, rng)
+        densities = np.stack([law.log_density(measured) for law in laws])
+        joint = densities + log_prior[:, None]
+        posterior = joint[i] - logsumexp(joint, axis=0)
+        weight = float(np.exp(log_prior[i]))
+        nats += weight * float((posterior - log_prior[i]).mean())
+        truth_probability += weight * float(np.exp(posterior).mean())
+        others = np.delete(densities, i, axis=0)
+        margin = min(margin, float(np.median(densities[i] - others, axis=1).min()))
+    return Information(max(nats, 0.0), truth_probability, margin)

@@ -1,4 +1,15 @@
-"""A simulator of the user's against drives of a car: what it lacks, and which of its parameters are wrong."""
+"""A simulator of the user's against drives of a car: what it lacks, and which of its parameters are wrong.
+
+Let S be the simulator, M its surrogate, and y what the car did under the same commands. The simulator predicts y as
+
+    S(u) = M(u) + d,   d = S(u) - M(u),
+
+so the gap between car and simulator is that between `y - d` and the chain M. A diagnosis with M as its baseline, of a
+log from which `d` is subtracted, is a diagnosis of the simulator; `d` is known row by row and needs no model. Effects
+and parameters are then asked of M: exact where they act on the output (sensors, forces), where they commute with the
+rest of the simulator (a delay), or where M holds what they do not commute with; else to first order in `d`, which is
+small where the surrogate is good.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +17,80 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.external.adjusting import Rollouts, adjusted
-from avtorch.external.discrepancy import responses
-from avtorch.external.lateness import lateness
 from avtorch.external.surrogate import Surrogate
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.simulator_under_test import SAME_KIND, ParameterDifference, SimulatorUnderTest
 from avtorch.gap.simulator.plant import GapPlant
+from avtorch.gap.simulator.simulator_input import SimulatorInput
 from avtorch.io import Log
+
+
+def responses(drives: Log, plant: GapPlant) -> dict[str, FloatArray]:
+    """What `plant` does in `drives` by the channels that these have, (time,): acceleration [m/s²] and speed [m/s], anew
+    from each segment's first row. Rows under the driver keep what is there."""
+    found = {name: values.copy() for name in ("accel", "speed") if (values := getattr(drives, name)) is not None}
+    for segment in range(int(drives.segment[-1]) + 1):
+        rows = drives.segment == segment
+        if rows.sum() < 2 or not drives.engaged[rows].any():  # under the driver there is no simulator
+            continue
+        response = plant.response(SimulatorInput.from_log(drives, segment))
+        answers = {"accel": response.accel_measured, "speed": response.speed}
+        for name, values in found.items():
+            values[rows] = answers[name].numpy()
+    return found
+
+
+def discrepancy(simulated: Log, surrogate: GapPlant) -> dict[str, FloatArray]:
+    """`d` by channel, (time,): acceleration [m/s²] and, from each segment's start, speed [m/s]."""
+    return {name: getattr(simulated, name) - values for name, values in responses(simulated, surrogate).items()}
+
+
+def without_discrepancy(log: Log, simulated: Log, surrogate: GapPlant) -> Log:
+    """The car's `log` less what the simulator does beyond its surrogate, row by row.
+
+    Raises `InputError` where the simulator's output lacks a channel of the log.
+    """
+    known = discrepancy(simulated, surrogate)
+    channels = {name: getattr(log, name) for name in ("accel", "speed") if getattr(log, name) is not None}
+    shared = {name: values - known[name] for name, values in channels.items() if name in known}
+    if not shared:
+        raise InputError(f"{simulated.name}: found {' and '.join(known)}, needs {' or '.join(channels)} as {log.name}")
+    return replace(log, **{name: shared.get(name) for name in channels})
+
+
+_STEP_MPS2, _RATE_HZ = 0.5, 100
+_BEFORE_S, _AFTER_S, _SETTLED_S = 1.0, 9.0, 1.0
+
+
+def lateness(plant: GapPlant, speed: float) -> float:
+    """Mean delay [s] of the acceleration that answers a step in the command, at a speed [m/s].
+
+    It is the area between the step and its answer, over the answer's height: `T_L` for GLVD, and the sum of the delays
+    of all that the command passes. At least `T_L`, also for a plant that does not answer a step of 0.5 m/s².
+    """
+    time = np.arange(round((_BEFORE_S + _AFTER_S) * _RATE_HZ)) / _RATE_HZ
+    step = np.where(time < _BEFORE_S, 0.0, _STEP_MPS2)
+    still = 0.0 * time
+
+    def accel(command: FloatArray) -> FloatArray:
+        drive = Log.from_arrays(time=time, accel_cmd=command, accel=still, speed=still + max(speed, 1.0))
+        return responses(drive, plant)["accel"]
+
+    # without the forces that act whatever the command
+    answer = accel(step) - accel(still)
+    height = float(answer[-round(_SETTLED_S * _RATE_HZ) :].mean())
+    least = float(plant.T_L)
+    if abs(height) < 1e-3 * _STEP_MPS2:
+        return least
+    after = time >= _BEFORE_S
+    return max(float(trapezoid(1.0 - answer[after] / height, dx=1 / _RATE_HZ)), least)
+
 
 HORIZON_S = 10.0
 _FARTHEST = 4.0  # times as large or small, that lag and gain may be on the car

@@ -2,32 +2,219 @@
 
 Both are scored on the same rows, by the errors of rollouts over 10 s as `avtorch.compare` has them. Nothing is fitted
 to the car: the surrogates are fitted to the simulators' own output. So nothing has to be held out.
+
+Let `s_b` and `t_b` be the shares of block `b` in the squared errors S and T of the two. The logarithm of the ratio of
+the root mean squares, log(T / S) / 2, moves by `(t_b - s_b) / 2` with the weight of block `b`. Over n blocks it thus
+has the variance
+
+    n / (n - 1) Σ_b ((t_b - s_b) / 2)²
+
+(the linearised jackknife), and Student's t of n - 1 degrees. Channels count alike: their logarithms are averaged.
+
+By what one is nearer: let S be the farther simulator, M its surrogate, and M' the same chain with some parts (lag,
+gain, effects) as in the other's surrogate. Then S + M' - M is S with those parts as in the other one, as far as the
+surrogates are what the simulators are. Parts compensate each other (a gain and a drag, a lag and a dead time), so what
+one is worth depends on which others have been put in before. Each gets its mean over all orders (Shapley 1953) of what
+it does to the logarithm of the error. So the factors of all differences multiply to that of all of them together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from math import factorial
 from os import PathLike, fspath
 
 import numpy as np
 import torch
+from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.external.by_what import differences
-from avtorch.external.driven_plant import DrivenPlant
 from avtorch.external.external_simulator import ExternalSimulator
-from avtorch.external.scored_blocks import ScoredBlocks
-from avtorch.external.simulator_comparison import MATERIAL, ComparedSimulator, ErrorsOfTwo, SimulatorComparison
+from avtorch.external.simulator import DrivenPlant
+from avtorch.external.simulator_comparison import (
+    MATERIAL,
+    OTHERS,
+    ComparedSimulator,
+    Difference,
+    ErrorsOfTwo,
+    SimulatorComparison,
+)
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.compare import LEVEL
-from avtorch.gap.drive_record import Record
+from avtorch.gap.drive_record import FEWEST_BLOCKS, Record, blocks_of
+from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import LogFacts
+from avtorch.gap.rollout_errors import HORIZON_S, block_squares, reached, rolled_out
+from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log, LogSource, as_logs
 from avtorch.io.mapping import Pairs
+
+_LEAST = 1e-9  # m/s² or m/s: an error, so that simulators without any have a ratio
+
+
+@dataclass(frozen=True, eq=False)
+class LogRatio:
+    """Logarithm of a ratio: `mean`, and what each block adds to it, `by_block` (block,), in the sum zero."""
+
+    mean: float
+    by_block: FloatArray
+
+    def __add__(self, other: LogRatio) -> LogRatio:
+        return LogRatio(self.mean + other.mean, self.by_block + other.by_block)
+
+    def __sub__(self, other: LogRatio) -> LogRatio:
+        return self + -1.0 * other
+
+    def __rmul__(self, factor: float) -> LogRatio:
+        return LogRatio(factor * self.mean, factor * self.by_block)
+
+    @property
+    def sd(self) -> float:
+        """Standard deviation, by the spread between blocks."""
+        n = len(self.by_block)
+        return float(np.sqrt(n / (n - 1) * (self.by_block**2).sum()))
+
+    @property
+    def ratio(self) -> Quantity:
+        """The ratio itself."""
+        sure = float(student.ppf(0.95, len(self.by_block) - 1))  # pyright: ignore[reportUnknownMemberType]
+        return Quantity.of_logarithm(self.mean, self.sd**2, sure)
+
+    def p_below(self, limit: float) -> float:
+        """Probability that the ratio is below `limit`."""
+        away = float(np.log(limit)) - self.mean
+        if self.sd == 0:
+            return float(away > 0)
+        return float(student.cdf(away / self.sd, len(self.by_block) - 1))  # pyright: ignore[reportUnknownMemberType]
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredBlocks:
+    """`blocks` of a record, by which rollouts of `horizon_s` [s] are scored."""
+
+    record: Record = field(repr=False)
+    blocks: tuple[slice, ...]
+    horizon_s: float
+
+    @classmethod
+    def of(cls, record: Record) -> ScoredBlocks:
+        """Those of a record. Raises `InputError` for less than five."""
+        blocks = tuple(blocks_of(record, fewest=FEWEST_BLOCKS))
+        if len(blocks) < FEWEST_BLOCKS:
+            raise InputError(
+                f"logs: found {len(blocks)} blocks of 4 s of usable driving, needs {FEWEST_BLOCKS} or more"
+            )
+        return cls(record, blocks, reached(record, HORIZON_S))
+
+    def squares(self, errors: FloatArray, lag: float) -> dict[str, FloatArray]:
+        """Squared errors by metric (block,), of a long rollout's `errors` (channel, counted, group); `lag` [s] of its
+        actuator."""
+        least = _LEAST**2 * self._rows
+        return {
+            name: np.maximum(x, least)
+            for name, x in block_squares(self.record, errors, self.blocks, lag, self.horizon_s).items()
+        }
+
+    def log_ratio(self, one: Mapping[str, FloatArray], two: Mapping[str, FloatArray]) -> LogRatio:
+        """Of the errors of `two` to those of `one`, squares (block,) by metric; the mean over the metrics."""
+        mean = float(np.mean([np.log(two[m].sum() / one[m].sum()) / 2 for m in one]))
+        return LogRatio(mean, np.mean([(two[m] / two[m].sum() - one[m] / one[m].sum()) / 2 for m in one], 0))
+
+    def error(self, squares: FloatArray) -> Quantity:
+        """Root mean square of errors, squares (block,)."""
+        rows = self._rows
+        share = (squares / squares.sum() - rows / rows.sum()) / 2
+        return LogRatio(float(np.log(squares.sum() / rows.sum())) / 2, share).ratio
+
+    @property
+    def _rows(self) -> FloatArray:
+        return np.array([(b.stop - b.start) * self.record.group for b in self.blocks], dtype=float)
+
+
+_SAME = 0.01  # relative difference of parameters that is none
+_MOST = 6  # differences told one by one; those that do less alone are told together
+
+
+def differences(
+    scored: ScoredBlocks, chains: Sequence[GapPlant], far: int, errors: FloatArray
+) -> tuple[Difference, ...]:
+    """What the `chains` of two simulators have differently, that which most brings number `far` nearer first.
+
+    `errors` (channel, counted, group): those of the simulator `far`.
+    """
+    base, donor = chains[far], chains[1 - far]
+    own = rolled_out(scored.record, base)
+    sides = {name: [_values(chain, name) for chain in chains] for name in _parts(chains)}
+    apart = [name for name, (one, two) in sides.items() if not _alike(one, two)]
+    known: dict[frozenset[str], LogRatio] = {}
+    before = scored.squares(errors, float(base.T_L))
+
+    def with_parts(names: frozenset[str]) -> LogRatio:
+        """Of the error with these parts as in the other one to what it is."""
+        if names not in known:
+            changed = base
+            for name in sorted(names):
+                changed = _with_part(changed, donor, name)
+            moved = errors + own - rolled_out(scored.record, changed) if names else errors
+            known[names] = scored.log_ratio(before, scored.squares(moved, float(changed.T_L)))
+        return known[names]
+
+    alone = sorted(apart, key=lambda name: -abs(with_parts(frozenset((name,))).mean))
+    groups = {name: frozenset((name,)) for name in alone[:_MOST]}
+    if alone[_MOST:]:
+        groups[OTHERS] = frozenset(alone[_MOST:])
+    found = []
+    for name, own_parts in groups.items():
+        others = [group for other, group in groups.items() if other != name]
+        share = LogRatio(0.0, np.zeros(len(scored.blocks)))
+        for count in range(len(others) + 1):
+            weight = factorial(count) * factorial(len(others) - count) / factorial(len(others) + 1)
+            for chosen in combinations(others, count):
+                there = frozenset().union(*chosen)
+                share += weight * (with_parts(there | own_parts) - with_parts(there))
+        one, two = sides.get(name, (None, None))
+        found.append(Difference(name, one, two, share.ratio, tuple(sorted(own_parts))))
+    return tuple(sorted(found, key=lambda difference: difference.ratio.mean))
+
+
+def _parts(chains: Sequence[GapPlant]) -> list[str]:
+    """`T_L`, `K_L` and the effects of either. An effect that shares the actuator's lag takes `T_L` with it."""
+    effects = {e.name: e for chain in chains for e in chain.effects}
+    lag = [] if any(_shares_lag(e) for e in effects.values()) else ["T_L"]
+    return [*lag, "K_L", *effects]
+
+
+def _shares_lag(effect: Effect) -> bool:
+    return "tau" in effect.actuator_parameters()
+
+
+def _with_part(base: GapPlant, donor: GapPlant, name: str) -> GapPlant:
+    """`base` with one part as in `donor`."""
+    if name in ("T_L", "K_L"):
+        return base.with_values({name: getattr(donor, name)})
+    given = [e for e in donor.effects if e.name == name]
+    kept = [e for e in base.effects if e.name != name]
+    lag = donor if any(_shares_lag(e) for e in (*donor.effects, *base.effects) if e.name == name) else base
+    return GapPlant([*kept, *given], T_L=lag.T_L, K_L=base.K_L, sigma=base.sigma)
+
+
+def _values(chain: GapPlant, name: str) -> dict[str, float] | None:
+    if name in ("T_L", "K_L"):
+        return {name: float(getattr(chain, name))}
+    report = chain.report()
+    return None if name not in report else {k: float(x) for k, x in report[name].items() if x.dim() == 0}
+
+
+def _alike(one: dict[str, float] | None, two: dict[str, float] | None) -> bool:
+    if one is None or two is None or one.keys() != two.keys():
+        return False
+    return all(np.isclose(one[key], two[key], rtol=_SAME, atol=0.0) for key in one)
+
 
 Progress = Callable[[str, int, int], None]
 _CHANNELS = ("accel", "speed")

@@ -1,7 +1,8 @@
 """A simulator driven along the commands of a car's log, in an open loop.
 
 It begins anew wherever the car does: at each segment, where the driver lets go, and at each start from standstill.
-Between these it drives on its own, at its own speed.
+Between these it drives on its own, at its own speed. At rest a brake holds a car whatever the command says, and a car
+and its simulator stop at different moments, so rows in which either stands do not count.
 """
 
 from __future__ import annotations
@@ -13,14 +14,41 @@ import time as clock
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, quoted
-from avtorch.external.drives import drives_of, in_drives
 from avtorch.external.simulator import Simulator, WholeDrives
 from avtorch.io import Log
+
+
+def drives_of(log: Log) -> list[slice]:
+    """Rows of `log` that a simulator drives in one go."""
+    out = []
+    for part in log.engaged_segments():
+        starts = [part.start]
+        if log.speed is not None:
+            stands = log.speed[part] < log.standstill_mps
+            starts += [part.start + int(k) for k in np.flatnonzero(np.diff(stands.astype(int)) == -1)]
+        edges = [*dict.fromkeys(starts), part.stop]
+        out += [slice(a, b) for a, b in pairwise(edges) if b - a > 1]
+    return out
+
+
+def in_drives(simulated: Log, log: Log) -> Log:
+    """The simulator's output, in the rows of the car's `log`, with a segment for each of the car's drives.
+
+    Rows in which either stands are not `engaged`.
+    """
+    edges = np.zeros(log.rows + 1, dtype=np.int64)
+    for part in drives_of(log):
+        edges[[part.start, part.stop]] = 1
+    edges[1:-1] |= np.diff(log.segment) != 0
+    segment = np.cumsum(edges[:-1]) - edges[0]
+    return replace(simulated, segment=segment, engaged=simulated.engaged & log.moving & simulated.moving)
+
 
 LIMIT_S = 30.0
 """Longest that a simulator may take for one step or one reset [s]."""
@@ -46,22 +74,6 @@ def driven_along(
 
     Raises `InputError` for a log without `accel_cmd`, and where the simulator raises, hangs for `limit_s`, or returns
     what is no pair of finite numbers, with the time in the log.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch import Log
-        >>> from avtorch.external.driving import driven_along
-        >>> class Car:
-        ...     def reset(self, *, speed, accel):
-        ...         self.speed, self.accel = speed, accel
-        ...     def step(self, accel_cmd, dt):
-        ...         self.accel += (1 - np.exp(-dt / 0.4)) * (accel_cmd - self.accel)
-        ...         self.speed += dt * self.accel
-        ...         return self.accel, self.speed
-        >>> time = np.arange(0.0, 10.0, 0.05)
-        >>> log = Log.from_arrays(time=time, accel_cmd=0.5 + 0 * time, accel=0 * time, speed=20 + 0 * time)
-        >>> round(float(driven_along(Car(), log).accel[-1]), 3)
-        0.5
     """
     if log.accel_cmd is None:
         raise InputError(f"{log.name}: has no accel_cmd, which the simulator would be driven by")

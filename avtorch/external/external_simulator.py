@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 from avtorch.errors import InputError, listed, quoted
 from avtorch.external.adjusting import Adjusted, Rollouts, adjusted, fewest_rollouts
 from avtorch.external.alignment import aligned
-from avtorch.external.answer import lag_and_gain, rollout_errors, with_simulator
-from avtorch.external.discrepancy import responses, without_discrepancy
-from avtorch.external.drives import in_drives
-from avtorch.external.driving import driven_along
-from avtorch.external.parameters import Limits, values_of, with_values
-from avtorch.external.side_by_side import side_by_side
-from avtorch.external.simulator import Simulator
+from avtorch.external.answer import lag_and_gain, responses, rollout_errors, with_simulator, without_discrepancy
+from avtorch.external.driving import driven_along, in_drives
+from avtorch.external.simulator import Limits, Simulator, values_of, with_values
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.plant import GapPlant
@@ -23,7 +22,11 @@ from avtorch.io import Log
 from avtorch.vehicle.plant import GLVDPlant
 
 Progress = Callable[[str, int, int], None]
+Values = Mapping[str, float]
+Answer = TypeVar("Answer")
 _MOST_PROCESSES = 64
+_copied: tuple[Simulator, Callable[[Simulator, Values], Any]] | None = None
+"""What a copy of this process drives."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +36,7 @@ class ExternalSimulator:
     `of`: its output under the car's commands, a log (or one for each of the car's drives), or the simulator itself: an
     object with `reset` and `step` (`Simulator`), or a class of such. `name`: what it is called in the answer. `step_s`:
     its own step [s], where it takes no other. `adjustable`: lowest and highest value of each of its parameters that may
-    be wrong, see `avtorch.external.parameters.values_of`; these are fitted to the car, with at most `most_rollouts`
+    be wrong, see `avtorch.external.simulator.values_of`; these are fitted to the car, with at most `most_rollouts`
     drives through its log, in so many `processes`, and the diagnosis is of the simulator with the car's values.
 
     Raises `InputError` for anything else.
@@ -127,10 +130,10 @@ class ExternalSimulator:
         """Drives of the simulator by the values of its adjustable parameters."""
         simulator = cast("Simulator", self.of)
 
-        def one(own: Simulator, values: Mapping[str, float]) -> tuple[Log, ...]:
+        def one(own: Simulator, values: Values) -> tuple[Log, ...]:
             return self._driven(with_values(own, values), logs)
 
-        def drive(places: Sequence[Mapping[str, float]]) -> list[tuple[Log, ...]]:
+        def drive(places: Sequence[Values]) -> list[tuple[Log, ...]]:
             first = not len(rollouts)  # by which it is told how long the others take
             if progress is not None and not first:
                 each = rollouts.seconds / len(rollouts)
@@ -219,3 +222,53 @@ def _beside(
     cars = [replace(log, engaged=other.engaged) for log, other in zip(logs, outputs, strict=True)]
     freed = tuple(without_discrepancy(log, other, surrogate.plant) for log, other in zip(cars, outputs, strict=True))
     return SimulatorBesideCar(simulator, surrogate, tuple(outputs), freed, offsets, errors, rollouts, fitted)
+
+
+@runtime_checkable
+class Apart(Protocol):
+    """A simulator that runs in a process of its own and can be had in another; an `FmuSimulator` is one."""
+
+    def apart(self) -> Simulator: ...
+
+    def close(self) -> None: ...
+
+
+def side_by_side(
+    simulator: Simulator, call: Callable[[Simulator, Values], Answer], each: Sequence[Values], processes: int
+) -> list[Answer]:
+    """`call(simulator, values)` for each of the values, in order, at most `processes` at once: an FMU in more processes
+    of its own, an object in copies of this one, or one after another where the system cannot copy a process (Windows).
+
+    Raises what a call raises.
+    """
+    count = min(processes, len(each))
+    if isinstance(simulator, Apart) and count > 1:
+        others = [simulator.apart() for _ in range(count)]
+        shares = [each[n::count] for n in range(count)]
+        try:
+            with ThreadPoolExecutor(count) as pool:
+                found = list(pool.map(lambda own, share: [call(own, values) for values in share], others, shares))
+        finally:
+            for own in others:
+                own.close()  # type: ignore[attr-defined]
+        return [found[k % count][k // count] for k in range(len(each))]
+    if count < 2 or "fork" not in multiprocessing.get_all_start_methods():
+        return [call(simulator, values) for values in each]
+    # a copy of the process has the simulator, which need not be one that can be sent
+    copies = multiprocessing.get_context("fork")
+    try:
+        with ProcessPoolExecutor(count, copies, _take_over, (simulator, call)) as pool:
+            return list(pool.map(_called, each))
+    except BrokenProcessPool:
+        raise InputError("simulator: ended the process that drove it") from None
+
+
+def _take_over(simulator: Simulator, call: Callable[[Simulator, Values], Any]) -> None:
+    global _copied
+    _copied = simulator, call
+
+
+def _called(values: Values) -> Any:
+    assert _copied is not None
+    simulator, call = _copied
+    return call(simulator, values)

@@ -1,28 +1,38 @@
-"""An FMU as a simulator: FMI 2 and 3, co-simulation, run in a process of its own."""
+"""An FMU as a simulator: FMI 2 and 3, co-simulation, run by FMPy in a process of its own."""
 
 from __future__ import annotations
 
+import importlib.util
+import json
 import math
 import os
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import weakref
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from avtorch.arrays import FloatArray
-from avtorch.deprecation import renamed
 from avtorch.errors import InputError, listed, printable, quoted
-from avtorch.external.fmu_child import FmuProcess
+from avtorch.external import fmu_process
+from avtorch.external.fmu_process import NOT_RUNNING
 from avtorch.external.fmu_variables import SIGNALS, STARTS, Variable, ports
-from avtorch.io.formats.kinds import Kind, Library
-from avtorch.io.formats.library import refuse_missing
 from avtorch.io.mapping import mapping_beside
 from avtorch.io.opening import place
 from avtorch.io.toml import read_toml
 
-_FMU = Kind("an FMU", "", Library("fmpy", "fmpy", "fmu"), (".fmu",), "'PK', as a ZIP file")
+OPENING_S = 120.0
+"""For unpacking, for loading and for the begin of a drive: starting the tool behind an FMU can take a minute."""
 _WHOLE = 1e-6  # how far from a whole number of an FMU's steps a step of the log may be: clocks write 6 digits
 _OTHER_START = 1e-6  # m/s or m/s², beyond which an FMU begins elsewhere than it was told
 
@@ -61,7 +71,6 @@ class FmuSimulator:
         20.0
     """
 
-    @renamed(until="0.3", names="map", step_seconds="timeout_s")
     def __init__(
         self,
         path: str | os.PathLike[str],
@@ -75,14 +84,15 @@ class FmuSimulator:
             raise InputError(f"timeout_s: found {timeout_s!r}, needs a number of seconds up to 86400")
         self.path = Path(path)
         source = place(path)
-        refuse_missing(source, _FMU)
+        if importlib.util.find_spec("fmpy") is None:
+            raise InputError(f"{source}: is an FMU; reading it needs fmpy: pip install 'avtorch[fmu]'")
         if not self.path.is_file():
             what = "is no regular file" if self.path.exists() else "no such file"
             raise InputError(f"{source}: {what}; an FMU is needed")
         told = _told(self.path, mapping)
         wanted = told[0] | _known("map", map, (*SIGNALS, *STARTS)), told[1] | _known("unit", unit, SIGNALS)
-        self._shared = _Shared(self.path, float(timeout_s))
-        self._listing = self._shared.process().listing
+        self._process = _Process(self.path.absolute(), source, float(timeout_s))
+        self._listing = self._process.begun()
         try:
             self._ports = ports(source, self._listing, *wanted)
         except InputError:
@@ -170,8 +180,9 @@ class FmuSimulator:
             "at": accel / command.factor,
             "outputs": [port.where for port in shown],
         }
-        begun = self._shared.process().ask(request)
-        self._drive = self._shared.drive = object()
+        self._process.begun()
+        begun = self._process.ask(request, OPENING_S)["shown"]
+        self._drive = self._process.drive = object()
         self._step = None
         self._start_notes = _start_notes(zip(("accel", "speed"), begun, shown, (accel, speed), strict=True))
 
@@ -204,7 +215,7 @@ class FmuSimulator:
         return self._advance(command, steps)
 
     def _advance(self, command: FloatArray, dt: FloatArray) -> tuple[FloatArray, FloatArray]:
-        if self._drive is None or self._shared.drive is not self._drive or not self._shared.alive:
+        if self._drive is None or self._process.drive is not self._drive or not self._process.alive:
             raise InputError(f"{place(self.path)}: no drive is under way; needs reset first")
         if not np.isfinite(command).all():
             raise InputError(f"accel_cmd: found {command[~np.isfinite(command)][0]}, needs finite numbers")
@@ -212,9 +223,10 @@ class FmuSimulator:
         if not len(command):
             return command.copy(), command.copy()
         self._step = float(dt[0])
-        numbers = np.stack([command / self._ports["accel_cmd"].factor, length, count])
-        shown = self._shared.process().ask({"rows": len(command)}, numbers).reshape(2, -1)
-        return shown[0] * self._ports["accel"].factor, shown[1] * self._ports["speed"].factor
+        sent = (command / self._ports["accel_cmd"].factor).tolist()
+        steps = list(zip(sent, length.tolist(), count.astype(int).tolist(), strict=True))
+        shown = np.array(self._process.ask({"steps": steps}, self._process.timeout_s)["shown"])
+        return shown[:, 0] * self._ports["accel"].factor, shown[:, 1] * self._ports["speed"].factor
 
     def _parts(self, dt: FloatArray, before: float | None) -> tuple[FloatArray, FloatArray]:
         """Length [s] and number of the FMU's steps in each step of the log."""
@@ -243,13 +255,13 @@ class FmuSimulator:
     def apart(self) -> FmuSimulator:
         """The same FMU with the same parameters in another process, which `close` ends."""
         other = object.__new__(FmuSimulator)
-        other.__dict__.update(self.__dict__, _shared=self._shared.another(), _drive=None, _start_notes=())
+        other.__dict__.update(self.__dict__, _process=self._process.another(), _drive=None, _start_notes=())
         return other
 
     # its process ---------------------------------------------------------------------------------------------------
     def close(self) -> None:
         """End the process of the FMU; a later `reset` is refused."""
-        self._shared.close()
+        self._process.close()
 
     def __enter__(self) -> FmuSimulator:
         return self
@@ -261,33 +273,137 @@ class FmuSimulator:
         return f"FmuSimulator({os.fspath(self.path)!r})"
 
 
-class _Shared:
-    """The process of an FMU, begun again after it has failed, and the drive that it runs."""
+class _Process:
+    """The process of an FMU, begun again after it has failed; `drive`: the one that it runs."""
 
-    def __init__(self, path: Path, timeout_s: float) -> None:
-        self._source, self._path, self._seconds = place(path), path.absolute(), timeout_s
-        self._process: FmuProcess | None = None
-        self._closed = False
+    def __init__(self, path: Path, source: str, timeout_s: float) -> None:
+        self.source, self.timeout_s = source, timeout_s
         self.drive: object | None = None
+        self._path, self._closed = path, False
+        self._listing: dict[str, Any] = {}
+        self._finish: Any = None
 
     @property
     def alive(self) -> bool:
-        return self._process is not None and self._process.alive
+        return self._finish is not None and self._finish.alive
 
-    def another(self) -> _Shared:
-        return _Shared(self._path, self._seconds)
-
-    def process(self) -> FmuProcess:
-        if self._closed:
-            raise InputError(f"{self._source}: is closed; needs FmuSimulator(...) again")
-        if self._process is None or not self._process.alive:
-            self._process = FmuProcess(self._path, self._source, self._seconds)
-        return self._process
+    def another(self) -> _Process:
+        return _Process(self._path, self.source, self.timeout_s)
 
     def close(self) -> None:
+        """End it for good."""
         self._closed = True
-        if self._process is not None:
-            self._process.end()
+        self.end()
+
+    def end(self) -> None:
+        """End it, and leave nothing of it."""
+        if self._finish is not None:
+            self._finish()
+
+    def begun(self) -> dict[str, Any]:
+        """What the FMU has, its process begun where none runs. Raises `InputError` where it cannot be opened."""
+        if self._closed:
+            raise InputError(f"{self.source}: is closed; needs FmuSimulator(...) again")
+        if self.alive:
+            return self._listing
+        folder = tempfile.TemporaryDirectory(prefix="avtorch_fmu_", ignore_cleanup_errors=True)
+        clock, unpacked = Path(folder.name, "clock"), Path(folder.name, "fmu")
+        clock.write_bytes(np.array([NOT_RUNNING]).tobytes())
+        unpacked.mkdir()
+        self._clock = np.memmap(clock, np.float64, "r", shape=(1,))
+        # -P: nothing of the folder that the user happens to work in; a file, as its package would load PyTorch
+        command = [sys.executable or "python", "-P", "-W", "ignore", fmu_process.__file__]
+        environment = dict(os.environ, PYTHONPATH=os.pathsep.join(part for part in sys.path if part))
+        try:
+            self._child = subprocess.Popen(
+                [*command, os.fspath(self._path), self.source, os.fspath(unpacked), os.fspath(clock)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                cwd=folder.name,  # where it may write what it likes
+                env=environment,
+                start_new_session=True,  # with the tools that an FMU starts
+            )
+        except (OSError, ValueError) as fault:
+            raise InputError(f"{self.source}: no process can be started to run it ({fault})") from None
+        self._lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        threading.Thread(target=_forward, args=(self._child.stdout, self._lines), daemon=True).start()
+        self._finish = weakref.finalize(self, _end, self._child, folder)
+        self._listing = self.ask(None, OPENING_S)
+        return self._listing
+
+    def ask(self, request: dict[str, Any] | None, timeout_s: float) -> dict[str, Any]:
+        """The answer to a request, or what the process says first. Any error, an interruption too, ends the process:
+        the rest of an answer would be taken for the next one. Raises `InputError` naming the simulated time."""
+        try:
+            if request is not None:
+                with suppress(OSError):  # where it has ended, the answer tells how
+                    self._child.stdin.write(json.dumps(request).encode() + b"\n")  # type: ignore[union-attr]
+                    self._child.stdin.flush()  # type: ignore[union-attr]
+            answer = self._answer(timeout_s)
+            if "refused" in answer:
+                raise InputError(answer["refused"])
+            if "error" in answer:
+                raise self._failed(answer["error"])
+            return answer
+        except BaseException:
+            self.end()
+            raise
+
+    def _answer(self, timeout_s: float) -> dict[str, Any]:
+        """The next line, as long as the clock does not stand still for `timeout_s`."""
+        shown, since = math.nan, time.monotonic()
+        while True:
+            with suppress(queue.Empty):
+                try:
+                    return json.loads(self._lines.get(timeout=min(timeout_s / 8, 1.0)))
+                except ValueError:
+                    raise self._failed(f"it ended the process that ran it ({_ending(self._child)})") from None
+            if self._clock[0] != shown:
+                shown, since = float(self._clock[0]), time.monotonic()
+            elif time.monotonic() - since > timeout_s:
+                more = "" if timeout_s == OPENING_S else "; a longer timeout_s gives it more"
+                raise self._failed(f"it does not answer within {timeout_s:g} s{more}")
+
+    def _failed(self, what: str) -> InputError:
+        at = float(self._clock[0])
+        when = "before the first step" if at == NOT_RUNNING else f"in the step that begins at {at:.6g} s of the drive"
+        return InputError(f"{self.source}: {when}: {what}")
+
+
+def _forward(stream: IO[bytes], lines: queue.SimpleQueue[bytes]) -> None:
+    """The lines of a stream, and an empty one at its end."""
+    with suppress(OSError, ValueError):  # closed meanwhile
+        for line in stream:
+            lines.put(line)
+    lines.put(b"")
+
+
+def _ending(process: subprocess.Popen[bytes]) -> str:
+    """How a process ended, in words."""
+    _kill(process)
+    code = process.wait()
+    if code >= 0:
+        return f"status {code}"
+    return signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    with suppress(OSError):
+        if hasattr(os, "killpg") and process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        else:  # Windows has no groups to end
+            process.kill()
+
+
+def _end(process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[str]) -> None:
+    _kill(process)
+    process.wait()
+    for stream in (process.stdin, process.stdout):
+        if stream is not None:
+            with suppress(OSError):  # a request that nobody will read
+                stream.close()
+    folder.cleanup()
 
 
 def _told(path: Path, mapping: str | os.PathLike[str] | None) -> tuple[dict[str, str], dict[str, str]]:
@@ -310,19 +426,19 @@ def _told(path: Path, mapping: str | os.PathLike[str] | None) -> tuple[dict[str,
 
 
 def _known(where: str, given: Mapping[str, Any] | None, signals: tuple[str, ...]) -> dict[str, str]:
-    for signal, value in (given or {}).items():
-        if signal not in signals:
-            raise InputError(f"{where} {printable(str(signal), 40)}: not known; signals: {', '.join(signals)}")
+    for name, value in (given or {}).items():
+        if name not in signals:
+            raise InputError(f"{where} {printable(str(name), 40)}: not known; signals: {', '.join(signals)}")
         if not isinstance(value, str):
-            raise InputError(f"{where} {signal}: is a {type(value).__name__}; a text is needed")
+            raise InputError(f"{where} {name}: is a {type(value).__name__}; a text is needed")
     return dict(given or {})
 
 
 def _start_notes(begun: Any) -> tuple[str, ...]:
     si = {"accel": "m/s²", "speed": "m/s"}
     notes = []
-    for signal, value, port, asked in begun:
+    for name, value, port, asked in begun:
         at = value * port.factor
         if not abs(at - asked) <= _OTHER_START:
-            notes.append(f"{signal}: the FMU begins at {at:g} {si[signal]}, the drive at {asked:g} {si[signal]}")
+            notes.append(f"{name}: the FMU begins at {at:g} {si[name]}, the drive at {asked:g} {si[name]}")
     return tuple(notes)

@@ -1,8 +1,8 @@
-"""The process in which an FMU runs: native code that may end it, hang or answer nonsense.
+"""The process in which FMPy runs an FMU: native code that may end it, hang or answer nonsense.
 
-Arguments are the FMU, its name in messages, an empty folder to unpack it in, and the file of the clock. Each request
-is a line of JSON and the numbers it announces; each answer is a line of JSON, then numbers. Before each step the clock
-gets the simulated time, so that the process that waits knows how far a crash or a hang has come.
+Arguments are the FMU, its name in messages, an empty folder to unpack it in, and the file of the clock. Requests and
+answers are lines of JSON. Before each step the clock gets the simulated time, so that the process that waits knows how
+far a crash or a hang has come.
 
 It imports little: starting it is most of the time that a short drive takes.
 """
@@ -13,11 +13,11 @@ import ctypes
 import importlib
 import json
 import math
-import mmap
 import os
 import sys
 import zipfile
-from typing import Any, BinaryIO
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +33,7 @@ MOST_BYTES = 4 * 2**30
 MOST_MEMORY = 32 * 2**30
 """Bytes of address space, where the system can limit it; the virtual machines of some tools reserve a lot."""
 
-_REALS = {"Real": ctypes.c_double, "Float64": ctypes.c_double, "Float32": ctypes.c_float}
+_REALS = ("Real", "Float64", "Float32")
 Port = tuple[int, str]
 """Reference and type of a variable."""
 
@@ -43,19 +43,20 @@ class _Stopped(Exception):
 
 
 class RunningFmu:
-    """An FMU of which one instance at a time runs."""
+    """An FMU of which one instance at a time runs. Raises `InputError` for what cannot be run here."""
 
-    def __init__(self, path: str, where: str, folder: str) -> None:
-        self._where = where
+    def __init__(self, path: str, source: str, folder: str) -> None:
         try:
-            fmpy, self._fmi2, self._fmi3 = (importlib.import_module(f"fmpy{part}") for part in ("", ".fmi2", ".fmi3"))
+            fmpy, fmi2, fmi3 = (importlib.import_module(f"fmpy{part}") for part in ("", ".fmi2", ".fmi3"))
         except Exception as fault:
             raise InputError(
-                f"{where}: running an FMU needs fmpy, which cannot be loaded here ({reason(fault)}): "
+                f"{source}: running an FMU needs fmpy, which cannot be loaded here ({reason(fault)}): "
                 "pip install --force-reinstall 'avtorch[fmu]'"
             ) from None
+        self._said = ""
+        self._running = False
         try:
-            self._unpack(fmpy, path, folder)
+            _unpack(fmpy, path, source, folder)
             self.remarks: tuple[str, ...] = ()
             try:
                 self._described = fmpy.read_model_description(folder)
@@ -63,59 +64,44 @@ class RunningFmu:
                 self._described = fmpy.read_model_description(folder, validate=False)
                 problem = printable(str(fault.problems[0]), 160)
                 self.remarks = (f"modelDescription.xml departs from the standard ({problem})",)
-            self._fmu = self._loaded(fmpy, folder)
+            self._fmu, self._options = self._loaded(fmpy, fmi2, fmi3, source, folder)
         except InputError:
             raise
         except Exception as fault:
-            raise InputError(f"{where}: is damaged or of an unknown kind ({reason(fault)}); {NEED} is needed") from None
-        self._said = ""
-        self._running = False
-        self._time = self._base = 0.0
-        self._taken, self._length = 0, math.nan
+            raise InputError(
+                f"{source}: is damaged or of an unknown kind ({reason(fault)}); {NEED} is needed"
+            ) from None
 
-    def _unpack(self, fmpy: Any, path: str, folder: str) -> None:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
-            names = archive.namelist()
-        if size > MOST_BYTES:
-            raise InputError(f"{self._where}: unpacks to {size:,} bytes; needs {MOST_BYTES:,} at most")
-        if "modelDescription.xml" not in names:
-            raise InputError(f"{self._where}: is a ZIP file without modelDescription.xml; {NEED} is needed")
-        fmpy.extract(path, folder)
-
-    def _loaded(self, fmpy: Any, folder: str) -> Any:
-        described = self._described
-        version, kind = str(described.fmiVersion), described.coSimulation
+    def _loaded(self, fmpy: Any, fmi2: Any, fmi3: Any, source: str, folder: str) -> tuple[Any, dict[str, Any]]:
+        """The FMU's library, and how it is instantiated so that its last complaint is kept."""
+        version, kind = str(self._described.fmiVersion), self._described.coSimulation
         if kind is None or not version.startswith(("2.", "3.")):
             found = "model exchange alone" if kind is None else "co-simulation"
-            raise InputError(f"{self._where}: is of FMI {printable(version, 20)} with {found}; {NEED} is needed")
+            raise InputError(f"{source}: is of FMI {printable(version, 20)} with {found}; {NEED} is needed")
         here = fmpy.platform if version.startswith("2") else fmpy.platform_tuple
         binaries = os.path.join(folder, "binaries")
         if not os.path.isfile(os.path.join(binaries, here, kind.modelIdentifier + fmpy.sharedLibraryExtension)):
             others = sorted(os.listdir(binaries)) if os.path.isdir(binaries) else []
             has = f"binaries for {listed(others)}" if others else "no binaries"
-            raise InputError(f"{self._where}: has {has}; this machine needs {here}")
-        given = {"guid": described.guid, "unzipDirectory": folder, "modelIdentifier": kind.modelIdentifier}
-        if version.startswith("2"):
-            self._callbacks = self._logged(fmpy)
-            return self._fmi2.FMU2Slave(instanceName="avtorch", **given)
-        return self._fmi3.FMU3Slave(instanceName="avtorch", **given)
-
-    def _logged(self, fmpy: Any) -> Any:
-        """Callbacks that keep the last complaint of an FMU of FMI 2."""
-        fmi2 = self._fmi2
+            raise InputError(f"{source}: has {has}; this machine needs {here}")
+        given = {"guid": self._described.guid, "unzipDirectory": folder, "modelIdentifier": kind.modelIdentifier}
+        if version.startswith("3"):
+            return fmi3.FMU3Slave(instanceName="avtorch", **given), {
+                "logMessage": lambda env, status, kind, text: self._hear(status, text)
+            }
         callbacks = fmi2.fmi2CallbackFunctions()
-        callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(lambda env, name, status, kind, text: self._hear(status, text))
+        callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(
+            lambda env, name, status, category, text: self._hear(status, text)
+        )
         callbacks.allocateMemory = fmi2.fmi2CallbackAllocateMemoryTYPE(fmpy.calloc)
         callbacks.freeMemory = fmi2.fmi2CallbackFreeMemoryTYPE(fmpy.free)
         fmpy.logging.addLoggerProxy(ctypes.byref(callbacks))
-        return callbacks
+        return fmi2.FMU2Slave(instanceName="avtorch", **given), {"callbacks": callbacks}
 
     def _hear(self, status: int, text: bytes | None) -> None:
         if status > 1 and text:
             self._said = " ".join(text.decode("utf-8", "replace").split())
 
-    # what it has ---------------------------------------------------------------------------------------------------
     def listing(self) -> dict[str, Any]:
         """Its variables, units and steps, for JSON."""
         described, kind = self._described, self._described.coSimulation
@@ -131,82 +117,78 @@ class RunningFmu:
             "variables": [_variable(v, units) for v in described.modelVariables if not v.shape],
         }
 
-    # drives --------------------------------------------------------------------------------------------------------
-    def reset(self, values: list[tuple[int, str, float]], command: Port, at: float, outputs: list[Port]) -> list[float]:
+    def begin(self, values: list[tuple[int, str, float]], command: Port, at: float, outputs: list[Port]) -> list[float]:
         """Begin a drive with these start values and the command at `at`; what the outputs then show."""
         fmu, two = self._fmu, self._described.fmiVersion.startswith("2")
         self._said = ""
         if self._running:
             self._running = False
-            free = fmu.fmi2FreeInstance if two else fmu.fmi3FreeInstance
-            free(fmu.component)
-        if two:
-            fmu.instantiate(callbacks=self._callbacks, loggingOn=True)
-            fmu.setupExperiment(startTime=0.0)
-        else:
-            fmu.instantiate(loggingOn=True, logMessage=lambda env, status, kind, text: self._hear(status, text))
+            (fmu.fmi2FreeInstance if two else fmu.fmi3FreeInstance)(fmu.component)
+        fmu.instantiate(loggingOn=True, **self._options)
         self._running = True
+        if two:
+            fmu.setupExperiment(startTime=0.0)
         for reference, type_, value in values:
             getattr(fmu, f"set{type_}")([reference], [value if type_ in _REALS else int(value)])
         fmu.enterInitializationMode()
-        self._set, self._command = self._port(command, "Set")
-        self._gets = [self._port(port, "Get") for port in outputs]
-        self._command[0] = at
-        self._set()
+        set_command = getattr(fmu, f"set{command[1]}")
+        self._send: Callable[[float], None] = lambda u: set_command([command[0]], [u])
+        self._send(at)
         fmu.exitInitializationMode()
+        self._gets = [(getattr(fmu, f"get{type_}"), [reference]) for reference, type_ in outputs]
         self._time = self._base = 0.0
         self._taken, self._length = 0, math.nan
         return self._shown()
 
-    def _port(self, port: Port, way: str) -> tuple[Any, Any]:
-        """A call that sets or gets one number, and the cell that it lies in."""
-        fmu, (reference, type_) = self._fmu, port
-        version = self._described.fmiVersion[0]
-        call = getattr(fmu, f"fmi{version}{way}{type_}")
-        references, cell = (ctypes.c_uint * 1)(reference), (_REALS[type_] * 1)()
-        given = (fmu.component, references, 1, cell) + (() if version == "2" else (1,))
-        return lambda: call(*given), cell
-
     def _shown(self) -> list[float]:
-        for get, _ in self._gets:
-            get()
-        return [float(cell[0]) for _, cell in self._gets]
+        return [float(get(reference)[0]) for get, reference in self._gets]
 
-    def drive(self, command: FloatArray, length: FloatArray, count: FloatArray, clock: memoryview[float]) -> FloatArray:
-        """Hold each command over `count` steps of `length` [s]; the outputs at the end of each (output, row)."""
-        shown = np.empty((len(self._gets), len(command)))
-        for k, (u, h, n) in enumerate(zip(command.tolist(), length.tolist(), count.astype(int).tolist(), strict=True)):
-            self._command[0], clock[0] = u, self._time
-            self._set()
-            for _ in range(n):
+    def drive(self, steps: list[tuple[float, float, int]], clock: FloatArray) -> list[list[float]]:
+        """Hold each command over so many steps of a length [s]; the outputs (row, output) at the end of each."""
+        rows = []
+        for u, length, count in steps:
+            clock[0] = self._time
+            self._send(u)
+            for _ in range(count):
                 clock[0] = self._time
-                self._step(h)
-            shown[:, k] = self._shown()
-            if not np.isfinite(shown[:, k]).all():
+                self._step(length)
+            rows.append(self._shown())
+            if not all(map(math.isfinite, rows[-1])):
                 raise _Stopped(
-                    f"it answers {', '.join(f'{x:g}' for x in shown[:, k])} after steps of {h:g} s; finite numbers are "
-                    f"needed, which smaller steps may give (--step {h / 5:g}, in Python step_s)"
+                    f"it answers {', '.join(f'{x:g}' for x in rows[-1])} after steps of {length:g} s; finite numbers "
+                    f"are needed, which smaller steps may give (--step {length / 5:g}, in Python step_s)"
                 )
-        return shown
+        return rows
 
-    def _step(self, h: float) -> None:
-        if h != self._length:  # times are multiples of the step, as long as it is the same one
-            self._base, self._taken, self._length = self._time, 0, h
-        ended = self._fmu.doStep(self._time, h)
+    def _step(self, length: float) -> None:
+        if length != self._length:  # times are multiples of the step, as long as it is the same one
+            self._base, self._taken, self._length = self._time, 0, length
+        ended = self._fmu.doStep(self._time, length)
         if ended is not None:  # FMI 3
             _, terminated, early, reached = ended
             if terminated:
                 raise _Stopped("it ends the simulation")
             if early:
-                raise _Stopped(f"it returns at {reached:g} s, before the end of its step of {h:g} s")
+                raise _Stopped(f"it returns at {reached:g} s, before the end of its step of {length:g} s")
         self._taken += 1
-        self._time = self._base + self._taken * self._length
+        self._time = self._base + self._taken * length
 
     def why(self, fault: Exception) -> str:
         """An error of the FMU in one line, with what the FMU said of it."""
         if isinstance(fault, _Stopped):
             return str(fault)
         return reason(fault) + (f": {printable(self._said, 200)}" if self._said else "")
+
+
+def _unpack(fmpy: Any, path: str, source: str, folder: str) -> None:
+    with zipfile.ZipFile(path) as archive:
+        size = sum(entry.file_size for entry in archive.infolist())
+        names = archive.namelist()
+    if size > MOST_BYTES:
+        raise InputError(f"{source}: unpacks to {size:,} bytes; needs {MOST_BYTES:,} at most")
+    if "modelDescription.xml" not in names:
+        raise InputError(f"{source}: is a ZIP file without modelDescription.xml; {NEED} is needed")
+    fmpy.extract(path, folder)
 
 
 def _variable(v: Any, units: dict[str, Any]) -> dict[str, Any]:
@@ -243,38 +225,27 @@ def reason(fault: Exception) -> str:
     return printable(text.removesuffix(".") if kind == "FMICallException" else f"{kind}: {text}", 160)
 
 
-def serve(fmu: RunningFmu, requests: BinaryIO, out: BinaryIO, clock: memoryview[float]) -> None:
-    """Answer each of the requests; an error ends it, for nothing is certain of an FMU after one."""
-    for line in requests:
-        request = json.loads(line)
-        try:
-            if "rows" in request:
-                rows = request["rows"]
-                command, length, count = np.frombuffer(requests.read(24 * rows)).reshape(3, rows)
-                shown = fmu.drive(command, length, count, clock)
-            else:
-                shown = np.array(fmu.reset(**request))
-        except Exception as fault:
-            answer(out, {"error": fmu.why(fault)})
-            return
-        clock[0] = NOT_RUNNING
-        answer(out, {"numbers": shown.size}, [shown])
-
-
 def main() -> None:
-    """Serve one FMU until the standard input ends."""
+    """Serve one FMU until the standard input ends, or until an error, after which nothing is certain of an FMU."""
     limit_memory(MOST_MEMORY)
     out = answers_to()
-    path, where, folder, clock_file = sys.argv[1:]
-    with open(clock_file, "r+b") as file:
-        clock = memoryview(mmap.mmap(file.fileno(), 8)).cast("d")
+    path, source, folder, clock_file = sys.argv[1:]
+    clock = np.memmap(clock_file, np.float64, "r+", shape=(1,))
     try:
-        fmu = RunningFmu(path, where, folder)
+        fmu = RunningFmu(path, source, folder)
     except InputError as fault:
         answer(out, {"refused": str(fault)})
         return
     answer(out, fmu.listing())
-    serve(fmu, sys.stdin.buffer, out, clock)
+    for line in sys.stdin.buffer:
+        request = json.loads(line)
+        try:
+            shown = fmu.drive(request["steps"], clock) if "steps" in request else fmu.begin(**request)
+        except Exception as fault:
+            answer(out, {"error": fmu.why(fault)})
+            return
+        clock[0] = NOT_RUNNING
+        answer(out, {"shown": shown})
 
 
 if __name__ == "__main__":

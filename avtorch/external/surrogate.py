@@ -1,30 +1,104 @@
 """A chain of effects that answers as a simulator does: its surrogate.
 
 A simulator whose inside is unknown is identified by its own output, as a car is; but it has no noise, so what decides
-is least squares, and how much of the response is left to explain. The surrogate stands in for the simulator wherever
-one has to ask what it would have done with another parameter or with an effect more; what it leaves over is known, and
-stays the simulator's own (`discrepancy`).
+is least squares, and how much of the response is left to explain:
+
+    log L = -1/2 sum_c |R_c|² / s_c²
+
+with coefficients R (channel, frame, bin) below 10 Hz and the size s (channel,) [m/s²] of what is left. Frames held out
+say whether an effect is there. The surrogate stands in for the simulator wherever one has to ask what it would have
+done with another parameter or with an effect more; what it leaves over is known, and stays the simulator's own
+(`discrepancy`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.external.noise_free import NoiseFree
 from avtorch.gap.engine.car import plant_of
 from avtorch.gap.engine.coordinates import EFFECTS as ATOMS
 from avtorch.gap.engine.coordinates import EngineEffect, adopt
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.gauss_newton import objective
+from avtorch.gap.engine.gauss_newton import fit, jacobian, objective, prior_terms, whitened_jacobian
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import CLAIM_HZ
 from avtorch.gap.engine.search import other_limit, promises
 from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log
+
+_LATE_S = 0.1  # either way, of the speed against the acceleration: a step of the slowest simulators
+_FOLDS = 6
+
+
+@dataclass(eq=False)
+class NoiseFree(Hypothesis):
+    """A hypothesis about a simulator's output, whose errors have the size `sd` (channel,) [m/s²] and no colour."""
+
+    sd: FloatArray = field(default_factory=lambda: np.ones(1))
+
+    @property
+    def free(self) -> list[str]:
+        """Names of the coordinates that a fit moves: lag and gain, the speed's lateness, those of the effects."""
+        late = ["speed_delay"] if self.data.channel_count == 2 else []
+        return ["T_L", "K_L", *late, *(c.name for e in self.effects for c in ATOMS[e].coordinates)]
+
+    def limits(self, name: str) -> tuple[float, float]:
+        return (-_LATE_S, _LATE_S) if name == "speed_delay" else super().limits(name)
+
+    def copy(self) -> Self:
+        other = super().copy()
+        other.sd = self.sd
+        return other
+
+    def with_sd(self, sd: FloatArray) -> Self:
+        """The same hypothesis with errors of another size."""
+        other = self.copy()
+        other.sd = sd
+        return other.evaluate()
+
+    def fitted(self, iterations: int = 8) -> Self:
+        """The hypothesis at its best, changed in place."""
+        fit(self, iterations)
+        return self
+
+    def evaluate(self) -> Self:
+        self.predicted = self.response()
+        self.residual = self.data.measured - self.predicted
+        self.covariance = np.broadcast_to(np.diag(self.sd**2), (self.data.band_count, len(self.sd), len(self.sd)))
+        self.log_likelihood = -0.5 * float((whiten(self.data, self.covariance, self.residual) ** 2).sum())
+        return self
+
+    @property
+    def errors(self) -> FloatArray:
+        """Root mean square (channel,) [m/s²] of what is left."""
+        return np.sqrt((self.residual**2).sum((1, 2)) / (self.data.frame_count * self.data.frame_rows))
+
+    @property
+    def held_out(self) -> float:
+        """Root mean square of what is left of frames that the fit did not see, over `sd`, to first order."""
+        names, data = self.free, self.data
+        by_frame = (data.channel_count, data.frame_count, data.bin_count)
+        W = whitened_jacobian(self, jacobian(self, names)).reshape(len(names), *by_frame)
+        r = whiten(data, self.covariance, self.residual).reshape(by_frame)
+        precision, pull = prior_terms(self, names)
+        each = np.einsum("icfk,jcfk->fij", W, W, optimize=True)
+        scores = np.einsum("icfk,cfk->fi", W, r, optimize=True)
+        fold = np.arange(data.frame_count) % min(_FOLDS, data.frame_count)
+        total = 0.0
+        for k in range(int(fold.max()) + 1):
+            own = fold == k
+            A = each[~own].sum(0) + np.diag(precision)
+            step = np.linalg.lstsq(A, scores[~own].sum(0) + pull, rcond=None)[0]
+            total += float(((r[:, own] - np.tensordot(step, W[:, :, own], 1)) ** 2).sum())
+        return float(np.sqrt(total / r.size))
+
 
 MOST_EFFECTS = 8
 ENOUGH = 0.002
@@ -59,16 +133,6 @@ def surrogate_of(
     `progress(what, done, of)` is called at each effect.
 
     Raises `InputError` where the drives are too short, see `DriveData.of`.
-
-    Example:
-        >>> from avtorch import Leader, simulate
-        >>> from avtorch.external.surrogate import surrogate_of
-        >>> from avtorch.gap import DeadTime, plant
-        >>> late = plant([DeadTime(0.3)], T_L=0.5, sigma=0.0)
-        >>> output = simulate(Leader.default(start=30.0, duration=60.0, dt=0.05), plant=late).log()
-        >>> found = surrogate_of([output])
-        >>> {name: round(float(x), 2) for name, x in found.plant.values().items()}
-        {'T_L': 0.5, 'K_L': 1.0, 'dead_time.delay_s': 0.3}
     """
     data = DriveData.of(simulated)
     size = np.std(data.channel_rows(data.accel, data.speed), axis=1) + 1e-9

@@ -11,9 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from avtorch.errors import InputError
-from avtorch.external.driven_plant import DrivenPlant
-from avtorch.external.parameters import with_values
-from avtorch.external.simulator import Simulator
+from avtorch.external.simulator import DrivenPlant, Simulator, with_values
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.plant import GapPlant
 

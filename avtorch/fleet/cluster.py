@@ -5,14 +5,15 @@ from __future__ import annotations
 import importlib.util
 import logging
 import math
+import signal
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from avtorch.errors import InputError, printable, quoted
-from avtorch.fleet.places import INSTALL
+from avtorch.errors import InputError, quoted
+from avtorch.fleet.log_list import INSTALL, one_line
 
 ATTEMPTS = 3
 """Workers of a local cluster that may end under a task before it is tried alone, and then before it is given up."""
@@ -100,7 +101,7 @@ def _local(workers: int, memory: str) -> Iterator[Cluster]:
             host="127.0.0.1",
             dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,
-            preload=["avtorch.fleet.worker"],
+            preload=["avtorch.fleet.cluster"],
         )
         with cluster, Client(cluster) as client:
             yield Cluster(client, True, cluster.dashboard_link if shown else None, memory)
@@ -116,7 +117,7 @@ def _existing(scheduler: str) -> Iterator[Cluster]:
     try:
         client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as fault:
-        raise InputError(f"scheduler: {quoted(scheduler)} cannot be reached ({_line(fault)}); {needs}") from None
+        raise InputError(f"scheduler: {quoted(scheduler)} cannot be reached ({one_line(fault)}); {needs}") from None
     with client:
         try:
             client.wait_for_workers(1, timeout=CONNECT_S)
@@ -127,7 +128,9 @@ def _existing(scheduler: str) -> Iterator[Cluster]:
         versions: Any = client.run(_version, on_error="return")
         for worker, version in versions.items():
             if version != __version__:
-                found = f"no avtorch ({_line(version)})" if isinstance(version, BaseException) else f"avtorch {version}"
+                found = (
+                    f"no avtorch ({one_line(version)})" if isinstance(version, BaseException) else f"avtorch {version}"
+                )
                 raise InputError(f"scheduler: worker {worker} has {found}, needs avtorch {__version__}")
         yield Cluster(client, False, _dashboard(client), "its limit of memory")
 
@@ -160,6 +163,6 @@ def _quiet() -> Iterator[None]:
             logger.setLevel(before)
 
 
-def _line(fault: BaseException) -> str:
-    text = " ".join(str(fault).split())
-    return printable(f"{type(fault).__name__}: {text}" if text else type(fault).__name__, 160)
+def dask_setup(worker: Any) -> None:
+    """Leave Ctrl-C to the process that began the work, and it ends its workers."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

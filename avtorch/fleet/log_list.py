@@ -1,24 +1,261 @@
-"""The logs of a fleet: files, globs, folders and manifests, in paths or URLs, each with its car."""
+"""The logs of a fleet: files, globs, folders and manifests, in paths or URLs, each with its car and its content's hash.
+
+A manifest is a CSV file that names the logs, their cars and dates, and whatever else is known of them.
+"""
 
 from __future__ import annotations
 
+import csv
 import glob
 import hashlib
+import importlib.util
+import io
 import os
 import re
+import stat
+import tempfile
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path, PurePath
-from typing import Literal
+from typing import Any, Literal
 
-from avtorch.errors import InputError, printable
-from avtorch.fleet.manifest import is_manifest, read_manifest
-from avtorch.fleet.marks import is_rows
-from avtorch.fleet.places import file_system, is_url, url_of
+from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.answer_set import is_of_answer
 from avtorch.io.formats import is_recording
-from avtorch.io.opening import place
+from avtorch.io.mapping import mapping_beside, mapping_place, read_mapping
+from avtorch.io.opening import TooLarge, kind_of, place, read_regular
+
+INSTALL = "pip install 'avtorch[fleet]'"
+_CAN = (".blf", ".asc", ".log")
+"""Suffixes of logs that a database beside them decodes."""
+
+
+KEY, LABEL, STATUS = b"avtorch.key", b"avtorch.label", b"avtorch.status"
+
+
+def marks_of(path: str | os.PathLike[str]) -> dict[bytes, bytes]:
+    """The marks of a Parquet file; none where it is missing, damaged, or not of a fleet."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return pq.read_schema(path).metadata or {}
+    except (OSError, ValueError, pa.ArrowException):
+        return {}
+
+
+def is_rows(path: str | os.PathLike[str]) -> bool:
+    """Whether a Parquet file holds rows of a fleet, and no log."""
+    return KEY in marks_of(path)
+
+
+def is_url(text: str) -> bool:
+    """Whether `text` is for fsspec: `s3://bucket/drive.csv`, and no path."""
+    return "://" in text
+
+
+def file_system(url: str) -> tuple[Any, str]:
+    """The file system of a URL, and the path in it. Raises `InputError` where it cannot be reached."""
+    if importlib.util.find_spec("fsspec") is None:
+        raise InputError(f"{place(url)}: is a URL; reading it needs fsspec: {INSTALL}")
+    from fsspec.core import url_to_fs
+
+    try:
+        return url_to_fs(url)
+    except Exception as fault:  # each store has errors of its own, a missing package among them
+        raise InputError(f"{place(url)}: cannot be reached ({one_line(fault)})") from None
+
+
+def url_of(files: Any, path: str) -> str:
+    """The URL of a path in a file system, as `file_system` takes it."""
+    return str(files.unstrip_protocol(path))
+
+
+@contextmanager
+def fetched(log: str) -> Iterator[Path]:
+    """The log as a local file: itself, or for a URL a copy with the mapping beside it, removed afterwards.
+
+    Of a store only these two files are fetched: other files that a mapping names, databases and folders are not. Raises
+    `InputError` where it cannot be fetched.
+    """
+    if not is_url(log):
+        yield Path(log)
+        return
+    files, path = file_system(log)
+    with tempfile.TemporaryDirectory(prefix="avtorch-") as folder:
+        local = Path(folder) / (Path(path).name or "log")
+        try:
+            files.get_file(path, str(local))
+            mapping = mapping_place(Path(path))
+            if mapping.name != local.name and files.exists(str(mapping)):
+                files.get_file(str(mapping), str(local.with_name(mapping.name)))
+        except FileNotFoundError:
+            raise InputError(f"{place(log)}: no such file") from None
+        except Exception as fault:
+            raise InputError(f"{place(log)}: cannot be fetched ({one_line(fault)})") from None
+        yield local
+
+
+def content_hash(log: Path) -> tuple[str, int]:
+    """SHA-256 over a log and everything that says how to read it, and the bytes of the log itself.
+
+    That is the mapping beside it, the files that it names, and the databases beside a CAN log. Raises `InputError` for
+    what is no regular file, or folder of such files.
+    """
+    try:
+        own = sorted(p for p in log.rglob("*") if p.is_file()) if log.is_dir() else [log]
+        files = (*own, *_beside(log))
+    except InputError:
+        raise
+    except (OSError, ValueError) as fault:  # a name too long or with a null, a folder that is closed
+        raise InputError(f"{place(log)}: cannot be read ({_why(fault)})") from None
+    state, size = hashlib.sha256(), 0
+    for number, file in enumerate(files):
+        try:
+            info = os.stat(file)
+            if not stat.S_ISREG(info.st_mode):  # opening a pipe would wait for its writer
+                raise InputError(f"{place(file)}: is {kind_of(info.st_mode)}; a log is needed")
+            with file.open("rb") as stream:
+                digest = hashlib.file_digest(stream, "sha256")
+        except FileNotFoundError:
+            raise InputError(f"{place(file)}: no such file") from None
+        except InputError:
+            raise
+        except (OSError, ValueError) as fault:
+            raise InputError(f"{place(file)}: cannot be read ({_why(fault)})") from None
+        state.update(f"{file.name}:{info.st_size}:".encode("utf-8", "backslashreplace"))
+        state.update(digest.digest())
+        size += info.st_size if number < len(own) else 0
+    return state.hexdigest(), size
+
+
+def _beside(log: Path) -> list[Path]:
+    mapping = mapping_beside(log)
+    found = [] if mapping is None or not mapping.is_file() else [mapping]
+    if found:
+        try:
+            named = {one.file for one in read_mapping(log).elsewhere.values()}
+        except InputError:  # said when the log is read
+            named = set()
+        found += [file for name in sorted(named) if (file := log.parent / name).is_file()]
+    if log.suffix.lower() in _CAN and log.is_file():
+        found += sorted(p for p in log.parent.glob("*.dbc") if p.is_file())
+    return found
+
+
+def _why(fault: OSError | ValueError) -> str:
+    return printable(str(getattr(fault, "strerror", None) or fault), 160)
+
+
+def one_line(fault: BaseException) -> str:
+    """The kind of an error and its message."""
+    text = " ".join(str(fault).split())
+    return printable(f"{type(fault).__name__}: {text}" if text else type(fault).__name__, 160)
+
+
+MOST = 256 * 2**20
+"""Most bytes of a manifest."""
+_HEAD = 4096
+NEED = "a header such as log,car,date"
+
+
+def is_manifest(source: str) -> bool:
+    """Whether a file is a manifest and no log: a `.csv` whose header has `log`, and `car` or no `time` as logs have."""
+    if not source.lower().endswith(".csv"):
+        return False
+    try:
+        if is_url(source):
+            with fetched(source) as local:
+                head = _head(local)
+        else:
+            head = _head(Path(source))
+    except (InputError, OSError, ValueError):
+        return False
+    try:
+        names = [name.strip().lower() for name in next(csv.reader([head], delimiter=_delimiter(head)), [])]
+    except csv.Error:
+        return False
+    return "log" in names and ("car" in names or "time" not in names)
+
+
+def _delimiter(head: str) -> str:
+    """What separates the columns of a header: a comma, or the semicolon of spreadsheets where the comma is decimal."""
+    return ";" if ";" in head and "," not in head else ","
+
+
+def _head(path: Path) -> str:
+    if not path.is_file():
+        return ""
+    with path.open("rb") as stream:
+        return stream.read(_HEAD).decode("utf-8-sig", "replace").partition("\n")[0]
+
+
+def read_manifest(source: str) -> list[FleetLog]:
+    """The rows of a manifest; relative paths of logs are relative to its folder.
+
+    Raises `InputError` naming file, line and column: for a missing or doubled column, a line of another length, an
+    empty log or car, a log given twice, and a date that is not ISO 8601.
+    """
+    shown = place(source)
+    with fetched(source) as local:
+        try:
+            raw = read_regular(local, most=MOST, need="a manifest")
+        except TooLarge as fault:
+            raise InputError(f"{fault}; split the fleet") from None
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as fault:
+        line = raw.count(b"\n", 0, fault.start) + 1
+        raise InputError(f"{shown}: line {line}: is not UTF-8; a manifest is a CSV file in UTF-8") from None
+    reader = csv.reader(io.StringIO(text), delimiter=_delimiter(text.partition("\n")[0]), strict=True)
+    rows: list[FleetLog] = []
+    first: dict[str, int] = {}
+    try:
+        names = [name.strip() for name in next(reader, [])]
+        for column in ("log", "car"):
+            if column not in names:
+                raise InputError(f"{shown}: line 1: has no column {column}; needs {NEED}, found {listed(names)}")
+        if len(set(names)) < len(names) or not all(names):
+            raise InputError(f"{shown}: line 1: found {listed(names)}, needs a name of its own for each column")
+        for cells in reader:
+            if not any(cell.strip() for cell in cells):
+                continue
+            where = f"{shown}: row {len(rows) + 1} (line {reader.line_num})"
+            row = _row(source, where, names, cells)
+            if row.identity in first:
+                raise InputError(f"{where}, column log: {quoted(row.place)} is already in row {first[row.identity]}")
+            rows.append(row)
+            first[row.identity] = len(rows)
+    except csv.Error as fault:
+        raise InputError(f"{shown}: line {reader.line_num}: is no CSV ({fault})") from None
+    if not rows:
+        raise InputError(f"{shown}: has no row below its header; needs a log in each")
+    return rows
+
+
+def _row(source: str, where: str, names: list[str], cells: list[str]) -> FleetLog:
+    if len(cells) != len(names):
+        raise InputError(f"{where}: has {len(cells)} cells, needs {len(names)}, as the header has")
+    entry = {name: cell.strip() for name, cell in zip(names, cells, strict=True)}
+    for column in ("log", "car"):
+        if not entry[column]:
+            raise InputError(f"{where}, column {column}: is empty; needs {'a path' if column == 'log' else 'a name'}")
+    log, car, date = entry.pop("log"), entry.pop("car"), entry.pop("date", "")
+    if date:
+        try:
+            datetime.fromisoformat(date)
+        except ValueError:
+            raise InputError(
+                f"{where}, column date: found {quoted(date)}, needs a date such as 2026-11-23 or 2026-11-23T08:30"
+            ) from None
+    if not is_url(log) and not os.path.isabs(log):
+        parent = source.rpartition("/")[0] if is_url(source) else os.path.dirname(source)
+        log = f"{parent}/{log}" if is_url(source) else os.path.normpath(os.path.join(parent, log))
+    return FleetLog(log, car, date or None, {key: value for key, value in entry.items() if value})
+
 
 TABLES = (".csv", ".tsv", ".txt", ".dat", ".parquet", ".pq")
 """Suffixes of tables that a folder is searched for, also with `.gz`; recordings are recognised by themselves."""
@@ -106,8 +343,7 @@ def find_logs(
     if manifests:
         if len(given) > 1:
             raise InputError(f"{place(manifests[0])}: is a manifest; needs to be the only source")
-        rows = read_manifest(manifests[0])
-        return LogList(tuple(FleetLog(r.log, r.car, r.date, r.tags) for r in rows), "manifest")
+        return LogList(tuple(read_manifest(manifests[0])), "manifest")
     hidden = None if leave_out is None else Path(os.path.abspath(leave_out))
     found = dict.fromkeys(path for source in given for path in _logs_of(source, hidden))
     seen: dict[str, str] = {}

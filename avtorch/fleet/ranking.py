@@ -13,12 +13,17 @@ from datetime import UTC, datetime
 from statistics import fmean, pvariance
 from typing import Any
 
-from avtorch.fleet.causes import car_causes, fleet_causes
-from avtorch.fleet.effect_sizes import drive_sizes, effect_sizes
-from avtorch.fleet.folder import FleetFolder
+from avtorch.fleet.folder import DATASETS, FleetFolder, Row
 from avtorch.fleet.log_list import FleetLog, LogList
-from avtorch.fleet.population import APART, drive_belief, population
-from avtorch.fleet.rows import DATASETS, Row
+from avtorch.fleet.population import (
+    APART,
+    car_causes,
+    drive_belief,
+    drive_sizes,
+    effect_sizes,
+    fleet_causes,
+    population,
+)
 from avtorch.fleet.settings import FleetSettings, Step
 from avtorch.version import __version__
 

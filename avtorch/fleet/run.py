@@ -5,22 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError, quoted
 from avtorch.fleet.cluster import Cluster, connected, require_dask
-from avtorch.fleet.fleet_progress import FleetProgress
-from avtorch.fleet.folder import FleetFolder, task_key
-from avtorch.fleet.log_list import FleetLog, LogList, find_logs
-from avtorch.fleet.places import content_hash, fetched, is_url
+from avtorch.fleet.folder import FleetFolder, failure_rows, task_key
+from avtorch.fleet.log_list import FleetLog, LogList, content_hash, fetched, find_logs, is_url
 from avtorch.fleet.ranking import fleet_answer
-from avtorch.fleet.rows import failure_rows
 from avtorch.fleet.settings import STEPS, FleetSettings
-from avtorch.fleet.task import Task
-from avtorch.fleet.work_off import worked_off
+from avtorch.fleet.task import FleetProgress, Task, worked_off
 from avtorch.io import sole_use, write_json
 
 if TYPE_CHECKING:
@@ -97,7 +93,15 @@ def run_fleet(
             with connected(min(workers or _cores(), len(plan.tasks)), memory, scheduler) as cluster:
                 if connected_to is not None:
                     connected_to(cluster)
-                _work(cluster, folder, plan, FleetProgress(steps, plan.tasks, plan.kept))
+                told = FleetProgress(steps, plan.tasks, plan.kept)
+                for task, outcome in worked_off(cluster, plan.tasks):
+                    key = task_key(task.step, task.sha256, task.settings)
+                    about = {"sha256": task.sha256, "seconds": outcome.seconds, "report": outcome.report}
+                    told.done(
+                        task.step,
+                        folder.write(task.step, plan.logs[task.name], key, outcome.rows, **about),
+                        outcome.seconds,
+                    )
         answer = fleet_answer(found, folder, given)
         answer["notes"] += plan.notes
         answer["work"] = {"kept": plan.kept, "computed": len(plan.tasks)}
@@ -166,25 +170,6 @@ def _content(log: FleetLog) -> tuple[str, int] | InputError:
             return content_hash(local)
     except InputError as fault:
         return fault
-
-
-def _work(cluster: Cluster, folder: FleetFolder, plan: _Plan, told: FleetProgress) -> None:
-    tasks = plan.tasks
-    if cluster.local:
-        # the next worker goes on where one was killed
-        kept = folder.checkpoints()
-        tasks = [replace(task, checkpoint=str(kept / checkpoint_name(task))) for task in tasks]
-    for task, outcome in worked_off(cluster, tasks):
-        log, key = plan.logs[task.name], task_key(task.step, task.sha256, task.settings)
-        about = {"sha256": task.sha256, "seconds": outcome.seconds, "report": outcome.report}
-        status = folder.write(task.step, log, key, outcome.rows, **about)
-        told.done(task.step, status, outcome.seconds)
-    folder.clear()
-
-
-def checkpoint_name(task: Task) -> str:
-    """Of the log and of all that its answer is computed from: a checkpoint is of no use to other settings."""
-    return f"{task.name}-{task_key(task.step, task.sha256, task.settings)[:12]}.state"
 
 
 def _cores() -> int:

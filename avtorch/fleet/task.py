@@ -1,19 +1,24 @@
-"""The work on one log in one worker: a step of its answer, as rows; whatever goes wrong becomes a row that says why."""
+"""The work of a fleet: one step of one log in one worker, as rows, and all of it worked off by a cluster.
+
+Whatever goes wrong becomes a row that says why. As many tasks run at a time as the cluster has threads, so that a
+worker that ends costs its own.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from avtorch.errors import InputError, printable
-from avtorch.fleet.places import content_hash, fetched
-from avtorch.fleet.rows import Row, check_rows, diagnosis_rows, failure_rows, window_rows
-from avtorch.fleet.settings import FleetSettings, Step
-from avtorch.io import Damaged, Log
+from avtorch.fleet.cluster import ATTEMPTS, Cluster
+from avtorch.fleet.folder import Row, Status, check_rows, diagnosis_rows, failure_rows, window_rows
+from avtorch.fleet.log_list import content_hash, fetched
+from avtorch.fleet.settings import STEPS, FleetSettings, Step
+from avtorch.io import Log
 from avtorch.io.opening import place
 from avtorch.logcheck.check import check
 from avtorch.version import __version__
@@ -26,9 +31,8 @@ if TYPE_CHECKING:
 class Task:
     """A `step` for the log at `place` with this content; `size` [bytes]; a `name` that no other task of the run has.
 
-    `checkpoint`: a file that keeps what was finished, for a worker that comes after one that was killed; None where
-    workers share no disk with the caller. `report`: makes the page of a diagnosis, where one is wanted; a function that
-    the worker can import. `shown`: the place as the caller has it, for messages; None: as it is.
+    `report`: makes the page of a diagnosis, where one is wanted; a function that the worker can import. `shown`: the
+    place as the caller has it, for messages; None: as it is.
     """
 
     name: str
@@ -37,7 +41,6 @@ class Task:
     sha256: str
     size: int
     settings: FleetSettings
-    checkpoint: str | None = None
     report: Callable[[Diagnosis], str] | None = None
     shown: str | None = None
     version: str = __version__
@@ -65,8 +68,6 @@ def work(task: Task) -> Outcome:
                 raise RuntimeError("the log was changed while the fleet ran; needs another run")
             try:
                 rows, page = _rows(task, local)
-            except Damaged:
-                raise  # of the checkpoint, not of the log
             except InputError as fault:
                 rows = failure_rows("failed", str(fault))
     except InputError as fault:
@@ -105,18 +106,16 @@ def _estimated(task: Task, drive: Log, note: str | None) -> list[Row]:
     from avtorch.decision.settings import Setting
 
     given = task.settings
-    with _checkpoint(task) as kept:
-        found = estimate(
-            drive,
-            given.window,
-            estimator=given.estimator,
-            setting=Setting(time_gap=given.time_gap, gains=given.gains, scenarios=1),
-            accepted=given.accepted,
-            dead_time=given.dead_time,
-            seed=given.seed,
-            progress=False,  # the fleet's own tells of it
-            checkpoint=kept,
-        )
+    found = estimate(
+        drive,
+        given.window,
+        estimator=given.estimator,
+        setting=Setting(time_gap=given.time_gap, gains=given.gains, scenarios=1),
+        accepted=given.accepted,
+        dead_time=given.dead_time,
+        seed=given.seed,
+        progress=False,  # the fleet's own tells of it
+    )
     return window_rows(found, note)
 
 
@@ -138,13 +137,93 @@ def _diagnosed(task: Task, drive: Log, note: str | None) -> tuple[list[Row], str
     return diagnosis_rows(found, note), None if task.report is None else task.report(found)
 
 
-@contextmanager
-def _checkpoint(task: Task) -> Iterator[Path | None]:
-    """The task's checkpoint; it is removed unless the process is killed within."""
-    path = None if task.checkpoint is None else Path(task.checkpoint)
+def worked_off(cluster: Cluster, tasks: Sequence[Task]) -> Iterator[tuple[Task, Outcome]]:
+    """What `work` returns for each of the `tasks`, as they are done, begun in the order given.
+
+    A task whose worker ends is done again by another one. After `ATTEMPTS` times (or as often as the scheduler of
+    another cluster allows) all that is left of its log waits for the end, where nothing else runs beside it: Dask
+    suspects every task that a worker had when it ended. If its workers end as often again, its outcome is a row that
+    says so, and the log's later steps are not tried. Raises `InputError` where the scheduler is lost.
+    """
+    from distributed import as_completed
+
+    waiting, later = deque(tasks), deque[Task]()
+    running: dict[str, tuple[Task, Any]] = {}
+    suspected: set[str] = set()
+    ended: set[str] = set()
+    alone = False
+    futures = as_completed([], with_results=True, raise_errors=False, loop=cluster.client.loop)
     try:
-        yield path
+        while waiting or running or later:
+            if not waiting and not running:
+                waiting, later, alone = deque(sorted(later, key=_order)), deque(), True
+            most = 1 if alone else cluster.threads
+            while waiting and len(running) < most:
+                task = waiting.popleft()
+                if task.place in ended:
+                    yield task, _crashed("not tried: its worker ended at an earlier step")
+                elif task.place in suspected and not alone:
+                    later.append(task)
+                else:
+                    name = f"{task.name}-alone" if alone else task.name
+                    future = cluster.client.submit(work, task, key=name, pure=False)
+                    running[future.key] = task, future
+                    futures.add(future)
+            if not running:
+                continue
+            done, result = next(futures)
+            task, future = running.pop(done.key)
+            if done.status == "finished":
+                yield task, result
+            elif done.status != "error":
+                raise InputError("scheduler: the connection was lost; what was done is kept")
+            elif type(fault := future.exception()).__name__ != "KilledWorker":
+                yield task, _crashed(printable(f"{type(fault).__name__}: {fault}", 400))
+            elif not alone:
+                suspected.add(task.place)
+                later.append(task)
+            else:
+                ended.add(task.place)
+                times = f"{2 * ATTEMPTS} times" if cluster.local else "again and again"
+                yield task, _crashed(f"its worker ended {times}: killed, or beyond its memory ({cluster.limit})")
+            future.release()
     finally:
-        if path is not None:
-            with suppress(OSError):
-                path.unlink(missing_ok=True)
+        for _, future in running.values():
+            future.release()
+
+
+def _order(task: Task) -> int:
+    return STEPS.index(task.step)
+
+
+def _crashed(why: str) -> Outcome:
+    return Outcome(failure_rows("crashed", why), 0.0)
+
+
+FIRST_S: dict[Step, float] = {"check": 0.2, "estimate": 5.0, "diagnose": 20.0}
+"""What a step of a log takes [s], until one was done: of a minute's log on one core."""
+
+
+class FleetProgress:
+    """Calls `progress` with (sentence, done, of) in milliseconds of work; `kept`: answers that were there before."""
+
+    def __init__(self, progress: Callable[[str, int, int], None] | None, tasks: Sequence[Task], kept: int) -> None:
+        self._progress, self._kept = progress, kept
+        self._of: dict[Step, int] = {step: sum(task.step == step for task in tasks) for step in STEPS}
+        self._done: dict[Step, int] = dict.fromkeys(STEPS, 0)
+        self._seconds: dict[Step, float] = dict.fromkeys(STEPS, 0.0)
+        self._failed = 0
+
+    def done(self, step: Step, status: Status, seconds: float) -> None:
+        """A task was done."""
+        self._done[step] += 1
+        self._seconds[step] += seconds
+        self._failed += status != "done"
+        if self._progress is None:
+            return
+        all_ = sum(self._of.values())
+        words = f"{sum(self._done.values())} of {all_} answers, {self._failed} failed"
+        words += f", {self._kept} kept" if self._kept else ""
+        cost = {step: self._seconds[step] / n if n else FIRST_S[step] for step, n in self._done.items()}
+        done, of = (sum(1000 * cost[step] * n for step, n in counts.items()) for counts in (self._done, self._of))
+        self._progress(words, round(done), round(of))

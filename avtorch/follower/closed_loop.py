@@ -1,8 +1,9 @@
-"""The closed loop simulated from the recorded leader alone: law, delay, lag, speed and spacing."""
+"""The closed loop of law, delay and lag: simulated from the recorded leader alone, and whether it is string stable."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,10 @@ import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.follower.laws import FollowerMeasurements, HeadwayLaw, tensors
+from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.effect import delay_key
+from avtorch.vehicle.stability import chain_verdict, frequencies
+from avtorch.vehicle.stability.chain import actuator
 
 
 class LoopErrors(NamedTuple):
@@ -18,12 +22,6 @@ class LoopErrors(NamedTuple):
 
     `spacing` [m], `speed` [m/s]; `amplified`, `amplified_simulated`: spread of the car's speed over the leader's, as
     measured and in the simulated loop.
-
-    Example:
-        >>> from avtorch.follower import LoopErrors
-        >>> errors = LoopErrors(spacing=1.8, speed=0.4, amplified=1.12, amplified_simulated=1.09)
-        >>> errors.amplified > 1  # the car swings more than its leader
-        True
     """
 
     spacing: float
@@ -38,17 +36,6 @@ def loop_errors(
     """Simulate stretches of `seconds` of one drive, in one batch; rows `dt` [s] apart.
 
     `values`: the law's as `law.*`, `T_L` [s], the delay [s] by `delay_key()`; `K_L` is 1.
-
-    Example:
-        >>> from avtorch import Leader, simulate
-        >>> from avtorch.follower import ConstantTimeGap, FollowerMeasurements, loop_errors
-        >>> run = simulate(Leader.default(start=50.0, duration=60.0, dt=0.1))
-        >>> seen = FollowerMeasurements(run.spacing[0, 0], run.speed[0, 0], run.lead_speed[0, 0])
-        >>> law = {"spacing_gain_per_s2": 0.9, "speed_gain_per_s": 0.9, "time_gap_s": 1.0, "standstill_m": 5.0}
-        >>> values = {"T_L": 0.3, **{f"law.{name}": value for name, value in law.items()}}
-        >>> errors = loop_errors(ConstantTimeGap(), values, seen, dt=0.1, seconds=20.0)
-        >>> errors.spacing < 2.0, errors.speed < 1.0  # m and m/s
-        (True, True)
     """
     own = tensors({k.partition(".")[2]: v for k, v in values.items() if k.startswith("law.")})
     s, v, lead = (x.numpy() for x in seen)
@@ -96,3 +83,40 @@ def keeps_speed(seen: Sequence[FollowerMeasurements], dt: float, *, seconds: flo
 def _spread(x: FloatArray) -> float:
     """Spread about each stretch's own mean, (row, stretch)."""
     return float(np.sqrt(np.mean((x - x.mean(0)) ** 2))) + 1e-12
+
+
+@dataclass(frozen=True)
+class LoopStability:
+    """`p_locally_stable`, `p_string_stable`; `peak_gain` [-] over the draws that are locally stable, None where few."""
+
+    speed: float
+    p_locally_stable: float
+    p_string_stable: float
+    peak_gain: Quantity | None
+
+
+def loop_stability(law: HeadwayLaw, draws: Mapping[str, FloatArray], speeds: Sequence[float]) -> list[LoopStability]:
+    """Stability for small motions about `speeds` [m/s], of draws (draw,) by key.
+
+    The result does not depend on how the loop is divided into controller and car: only the product of gains and `K_L`
+    counts.
+    """
+    values = {k: torch.as_tensor(x) for k, x in draws.items()}
+    own = {k.partition(".")[2]: x for k, x in values.items() if k.startswith("law.")}
+    delay = values.get(delay_key(), torch.zeros_like(values["T_L"]))
+    chain = actuator(frequencies(points=500), values["T_L"], torch.ones_like(values["T_L"]), delay)
+    out = []
+    for speed in speeds:
+        s, v, lead = law.slopes(own, speed)
+        gains = torch.stack(torch.broadcast_tensors(s, lead, torch.zeros_like(lead)), -1)
+        seen = chain_verdict(chain, (-v - lead) / s, gains)
+        peaks = seen.peak_gain[seen.locally_stable].numpy()
+        out.append(
+            LoopStability(
+                speed=float(speed),
+                p_locally_stable=float(seen.locally_stable.double().mean()),
+                p_string_stable=float(seen.string_stable.double().mean()),
+                peak_gain=Quantity.of_draws(peaks) if len(peaks) > 0.5 * len(delay) else None,
+            )
+        )
+    return out

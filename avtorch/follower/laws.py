@@ -19,17 +19,7 @@ Values = Mapping[str, Tensor]
 
 
 class FollowerMeasurements(NamedTuple):
-    """The law's inputs, (time,): `spacing` [m], own `speed` and `lead_speed` [m/s].
-
-    Example:
-        >>> import torch
-        >>> from avtorch.follower import ConstantTimeGap, FollowerMeasurements
-        >>> law, v = ConstantTimeGap(), torch.full((3,), 20.0, dtype=torch.float64)
-        >>> values = {p.name: p.typical().unsqueeze(-1) for p in law.parameters}
-        >>> balanced = law.spacing(values, 20.0) + torch.tensor([-5.0, 0.0, 5.0])
-        >>> law.command(values, FollowerMeasurements(balanced, speed=v, lead_speed=v)).sign().tolist()
-        [-1.0, 0.0, 1.0]
-    """
+    """The law's inputs, (time,): `spacing` [m], own `speed` and `lead_speed` [m/s]."""
 
     spacing: Tensor
     speed: Tensor
@@ -37,16 +27,7 @@ class FollowerMeasurements(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """Slopes of the demand for small motions: per metre of spacing, and per m/s of own and of lead speed.
-
-    Example:
-        >>> from avtorch.follower import ConstantTimeGap
-        >>> law = ConstantTimeGap()
-        >>> values = {p.name: p.typical() for p in law.parameters}
-        >>> slopes = law.slopes(values, speed=20.0)
-        >>> bool(slopes.lead_speed > 0 > slopes.speed)
-        True
-    """
+    """Slopes of the demand for small motions: per metre of spacing, and per m/s of own and of lead speed."""
 
     spacing: Tensor
     speed: Tensor
@@ -54,14 +35,7 @@ class Slopes(NamedTuple):
 
 
 class HeadwayLaw(Protocol):
-    """A headway law by `name`, with `parameters`.
-
-    Example:
-        >>> from avtorch.follower import LAWS, HeadwayLaw
-        >>> laws: list[HeadwayLaw] = list(LAWS.values())
-        >>> [law.name for law in laws]
-        ['constant_time_gap', 'intelligent_driver']
-    """
+    """A headway law by `name`, with `parameters`."""
 
     name: str
     parameters: tuple[Parameter, ...]
@@ -84,12 +58,6 @@ class ConstantTimeGap:
     """`u = k_s (s - s_0 - h v) + k_v (v_lead - v)`: the linear law of the paper, without its own acceleration.
 
     A gain on its own acceleration could not be distinguished from another lag.
-
-    Example:
-        >>> from avtorch.follower import ConstantTimeGap
-        >>> values = {p.name: p.typical() for p in ConstantTimeGap().parameters}
-        >>> round(float(ConstantTimeGap().spacing(values, speed=20.0)), 1)  # metres in equilibrium
-        27.8
     """
 
     name = "constant_time_gap"
@@ -118,14 +86,6 @@ class IntelligentDriver:
     """The Intelligent Driver Model (Treiber, Hennecke and Helbing 2000, Eq. 2 and 3).
 
     `u = a (1 - (v / v_0)^4 - (s* / s)²)` with `s* = s_0 + h v + v (v - v_lead) / (2 sqrt(a b))`.
-
-    Example:
-        >>> from avtorch.follower import IntelligentDriver
-        >>> law = IntelligentDriver()
-        >>> values = {p.name: p.typical() for p in law.parameters}
-        >>> slopes = law.slopes(values, speed=20.0)
-        >>> bool(slopes.spacing > 0), bool(slopes.speed < 0), bool(slopes.lead_speed > 0)
-        (True, True, True)
     """
 
     name = "intelligent_driver"
@@ -160,13 +120,7 @@ class IntelligentDriver:
 
 
 LAWS: dict[str, HeadwayLaw] = {law.name: law for law in (ConstantTimeGap(), IntelligentDriver())}
-"""The laws that a follower may obey, by name.
-
-Example:
-    >>> from avtorch.follower import LAWS
-    >>> {name: len(law.parameters) for name, law in LAWS.items()}
-    {'constant_time_gap': 4, 'intelligent_driver': 5}
-"""
+"""The laws that a follower may obey, by name."""
 
 
 def law_named(name: str) -> HeadwayLaw:

@@ -17,7 +17,7 @@ from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.exponential_form import PotentialTerms, terms_of
 from avtorch.inference.planes import join_planes
-from avtorch.vehicle.broadcasting import broadcast_shape
+from avtorch.vehicle.arguments import broadcast_shape
 
 _LOG_2PI = math.log(2 * math.pi)
 

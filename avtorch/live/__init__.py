@@ -17,40 +17,36 @@ Example:
     (2, {})
 """
 
-from avtorch.live.counts import REFUSED, Counts
 from avtorch.live.kept_cars import KeptCars
-from avtorch.live.line_parser import LineParser
-from avtorch.live.line_source import FileSource, StreamSource
-from avtorch.live.live_watch import Answer, LiveWatch
+from avtorch.live.line_source import FileSource
+from avtorch.live.line_source import StreamSource as StreamSource
+from avtorch.live.live_watch import Answer as Answer
+from avtorch.live.live_watch import LiveWatch
 from avtorch.live.mqtt import MqttAddress, MqttSink, MqttSource
 from avtorch.live.played_log import PlayedLog
-from avtorch.live.prometheus import Metrics
+from avtorch.live.prometheus import Metrics as Metrics
 from avtorch.live.settings import LiveSettings
-from avtorch.live.sink import FileSink, LineSink, Sink
-from avtorch.live.source import Batch, Row, Source, Stop
-from avtorch.live.watch_source import watch_source
+from avtorch.live.source import REFUSED as REFUSED
+from avtorch.live.source import Batch, LineParser, Row
+from avtorch.live.source import Counts as Counts
+from avtorch.live.source import Source as Source
+from avtorch.live.source import Stop as Stop
+from avtorch.live.watch_source import FileSink as FileSink
+from avtorch.live.watch_source import LineSink, watch_source
+from avtorch.live.watch_source import Sink as Sink
 
 __all__ = [
-    "REFUSED",
-    "Answer",
     "Batch",
-    "Counts",
-    "FileSink",
     "FileSource",
     "KeptCars",
     "LineParser",
     "LineSink",
     "LiveSettings",
     "LiveWatch",
-    "Metrics",
     "MqttAddress",
     "MqttSink",
     "MqttSource",
     "PlayedLog",
     "Row",
-    "Sink",
-    "Source",
-    "Stop",
-    "StreamSource",
     "watch_source",
 ]

@@ -12,8 +12,7 @@ from typing import BinaryIO
 
 from avtorch.errors import InputError, printable
 from avtorch.io.opening import kind_of
-from avtorch.live.line_parser import LONGEST, LineParser
-from avtorch.live.source import Batch, Row, Stop
+from avtorch.live.source import LONGEST, Batch, LineParser, Row, Stop
 
 CHUNK = 2**16
 """Bytes read at once."""
@@ -65,19 +64,7 @@ def _batch(parser: LineParser, lines: Iterator[tuple[bytes, int]], at: _Lines, *
 
 
 class StreamSource:
-    """Lines of an open descriptor, standard input by default, until it ends.
-
-    Example:
-        >>> import os
-        >>> from avtorch.live import Counts, LineParser, Stop, StreamSource
-        >>> end, begin = os.pipe()
-        >>> _ = os.write(begin, b'{"time": 0.01, "accel_cmd": 0.5, "speed": 20.0}')
-        >>> os.close(begin)
-        >>> source = StreamSource(LineParser(Counts(), car="red"), end)
-        >>> [(row.car, row.time) for batch in source.batches(Stop()) for row in batch.rows]
-        [('red', 0.01)]
-        >>> os.close(end)
-    """
+    """Lines of an open descriptor, standard input by default, until it ends."""
 
     name = "standard input"
     identity = None

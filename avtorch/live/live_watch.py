@@ -8,20 +8,14 @@ import torch
 
 from avtorch.inference.form import Form
 from avtorch.live.car import LiveCar, LiveWindow
-from avtorch.live.counts import Counts
 from avtorch.live.settings import LiveSettings
-from avtorch.live.source import Batch, Row
+from avtorch.live.source import Batch, Counts, Row
 from avtorch.results import window_entry
 
 
 class Answer(NamedTuple):
     """What is said of one window: the object that becomes a line of JSON, the car's name, the number of the window, and
     when its end had come (`time.monotonic`; None where it is no window).
-
-    Example:
-        >>> from avtorch.live import Answer
-        >>> Answer({"car": "red", "window": 3, "alerts": []}, "red", 3, None).number
-        3
     """
 
     entry: dict[str, Any]

@@ -17,10 +17,9 @@ from typing import Any
 from urllib.parse import unquote
 
 from avtorch.errors import InputError, printable, quoted
-from avtorch.live.line_parser import LineParser
 from avtorch.live.live_watch import Answer
-from avtorch.live.sink import line_of
-from avtorch.live.source import Batch, Row, Stop
+from avtorch.live.source import Batch, LineParser, Row, Stop
+from avtorch.live.watch_source import line_of
 
 INSTALL = "pip install 'avtorch[live]'"
 MESSAGES = 500

@@ -14,8 +14,7 @@ from avtorch.io import Log
 from avtorch.io.fingerprint import fingerprint
 from avtorch.io.mapping import Pairs
 from avtorch.io.no_command import no_command
-from avtorch.live.line_parser import SIGNALS
-from avtorch.live.source import Batch, Row, Stop
+from avtorch.live.source import SIGNALS, Batch, Row, Stop
 
 ROWS = 500
 """Rows of a batch where nothing is waited for."""

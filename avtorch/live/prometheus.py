@@ -21,13 +21,6 @@ class Metrics:
     """Metrics of `watch` under `http://HOST:PORT/metrics`, served by a thread from `start` to `close`.
 
     Raises `InputError` where prometheus-client is missing, and from `start` for a port that is taken.
-
-    Example:
-        >>> from avtorch.live import LiveWatch, Metrics
-        >>> watch = LiveWatch()
-        >>> watch.counts.refuse("late", 3)
-        >>> [line for line in Metrics(watch).text().splitlines() if line.startswith("avtorch_refused_total")]
-        ['avtorch_refused_total{kind="late"} 3.0']
     """
 
     def __init__(self, watch: LiveWatch) -> None:

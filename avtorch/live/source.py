@@ -1,15 +1,26 @@
 """What every live source gives: rows of cars, in batches of bounded size, when it is asked for them.
 
 A source is pulled. What it has not been asked for stays in the pipe, the file or the broker's queue, so that memory
-does not grow where the estimate is behind.
+does not grow where the estimate is behind. What becomes of messages that are no rows is counted by kind, and no line
+of JSON or CSV can stop the watch.
 """
 
 from __future__ import annotations
 
+import csv
+import json
 import time
+from collections import Counter
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from avtorch.errors import InputError, printable
+from avtorch.io.mapping import Pairs, pairs
+from avtorch.io.units import to_si
+from avtorch.numeral import numeral
 
 
 class Row(NamedTuple):
@@ -47,15 +58,7 @@ class Batch:
 
 
 class Stop:
-    """Set to make a source end after the batch it is at; a source looks at it at least every fifth of a second.
-
-    Example:
-        >>> from avtorch.live import Stop
-        >>> stop = Stop()
-        >>> stop.set()
-        >>> stop.is_set
-        True
-    """
+    """Set to make a source end after the batch it is at; a source looks at it at least every fifth of a second."""
 
     def __init__(self) -> None:
         self.is_set = False
@@ -66,17 +69,7 @@ class Stop:
 
 
 class Source(Protocol):
-    """Where rows come from.
-
-    Example:
-        >>> from avtorch.live import Batch, Row
-        >>> class Three:
-        ...     name, identity = "three rows", None
-        ...     def batches(self, stop, start=None):
-        ...         yield Batch([Row("red", 0.01 * i, {"accel_cmd": 0.5, "speed": 21.0}) for i in range(3)])
-        >>> sum(len(batch.rows) for batch in Three().batches(None))
-        3
-    """
+    """Where rows come from."""
 
     @property
     def name(self) -> str:
@@ -92,3 +85,218 @@ class Source(Protocol):
         """Batches until the source ends or `stop` is set; empty ones while nothing comes. `start`: a position to read
         on from."""
         ...
+
+
+REFUSED = {
+    "corrupt": "no JSON object, no row of the CSV header's length, or a line that is too long",
+    "incomplete": "without a time or a signal that the car's first row had",
+    "implausible": "a number that is not finite, or that no car reaches",
+    "doubled": "of a time that the car has sent already",
+    "late": "older than the rows that have been given to the estimate",
+    "jumped": "more than a minute from the rows before and after it",
+    "crowded": "beyond the greatest number of rows in a window",
+    "too many cars": "of a car beyond the greatest number of cars",
+    "contradictory": "of columns that contradict each other in unit or sign",
+    "failed": "of a window that could not be computed",
+}
+"""Why a message or a row was left out, by kind."""
+
+
+class Counts:
+    """Numbers since the first start: `rows` taken in, `refused` by kind, `reordered` rows that were put in their place,
+    `windows`, `alerts` by detector, `repeated` lines that an earlier run had written.
+    """
+
+    def __init__(self) -> None:
+        self.rows = self.reordered = self.windows = self.repeated = 0
+        self.refused: Counter[str] = Counter()
+        self.alerts: Counter[str] = Counter()
+
+    def refuse(self, kind: str, many: int = 1) -> None:
+        """Count `many` rows or messages left out for this reason, a key of `REFUSED`."""
+        self.refused[kind] += many
+
+    def to_dict(self) -> dict[str, Any]:
+        """The numbers as plain objects."""
+        own = {name: getattr(self, name) for name in ("rows", "reordered", "windows", "repeated")}
+        return {**own, "refused": dict(self.refused), "alerts": dict(self.alerts)}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Go on from `to_dict`. Raises `InputError` for anything else."""
+        try:
+            numbers = {name: int(state[name]) for name in ("rows", "reordered", "windows", "repeated")}
+            tables = [Counter({str(k): int(v) for k, v in state[name].items()}) for name in ("refused", "alerts")]
+        except (KeyError, TypeError, ValueError, AttributeError):
+            raise InputError("state: counts: are not those of a watch") from None
+        vars(self).update(numbers)
+        self.refused, self.alerts = tables
+
+
+SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "engaged")
+"""Signals that a watch uses; a row needs `accel_cmd`, and `accel` or `speed`."""
+LONGEST = 2**20
+"""Bytes of a line; a longer one is corrupt."""
+_CAR = 200  # characters of a car's name
+
+
+class LineParser:
+    """Lines to rows, JSON or CSV as the first line shows.
+
+    A line of JSON is an object with `time` [s], the signals, and `car` where there are several. CSV begins with a
+    header of the same names. `map` names other columns and `unit` other units, as for `Log.read`; `car` is the name
+    where a row has none. What is no row is counted in `counts`.
+
+    Raises `InputError` for a mapping or unit that is not known.
+
+    Example:
+        >>> from avtorch.live import Counts, LineParser
+        >>> counts = Counts()
+        >>> parser = LineParser(counts, unit=["speed=km/h"])
+        >>> parser.row(b'{"car": "red", "time": 1.5, "accel_cmd": 0.2, "speed": 72}')
+        Row(car='red', time=1.5, signals={'accel_cmd': 0.2, 'speed': 20.0}, position=None)
+        >>> parser.row(b'{"car": "red", "time":'), counts.to_dict()["refused"]
+        (None, {'corrupt': 1})
+    """
+
+    def __init__(self, counts: Counts, *, map: Pairs = None, unit: Pairs = None, car: str = "car") -> None:
+        self.counts, self.car = counts, car
+        columns = pairs("map", map)
+        units = pairs("unit", unit)
+        for name in (*columns, *units):
+            if name not in (*SIGNALS, "time"):
+                raise InputError(f"map, unit: found {name}, needs time or one of {', '.join(SIGNALS)}")
+        self._time = columns.get("time", "time")
+        self._columns = [(name, columns.get(name, name)) for name in SIGNALS]
+        one = np.ones(1)
+        self._factors = {name: float(to_si(name, text)(one)[0]) for name, text in units.items()}
+        self._header: list[str] | None = None
+        self._json: bool | None = None
+
+    def begin(self) -> None:
+        """What comes is another file's, with a first line of its own."""
+        self._header = self._json = None
+
+    def begun(self) -> bool:
+        """Whether the first line was seen: a CSV's header, or one that is JSON."""
+        return bool(self._json) or self._header is not None
+
+    def row(self, line: bytes, position: int | None = None) -> Row | None:
+        """The row of a line; None for an empty line, a header, and what was counted as refused."""
+        if not line.strip():
+            return None
+        if self._json is None:
+            line = line.removeprefix(b"\xef\xbb\xbf")
+            self._json = line.lstrip().startswith((b"{", b"["))
+        if len(line) > LONGEST:
+            return self._refused("corrupt")
+        return self._of_json(line, position, self.car) if self._json else self._of_csv(line, position)
+
+    def message(self, payload: bytes, *, car: str) -> list[Row]:
+        """The rows of a message: an object, several in a list, or one a line; `car` names the car of those without."""
+        if len(payload) > LONGEST:
+            self._refused("corrupt")
+            return []
+        if not payload.lstrip().startswith(b"["):
+            rows = [self._of_json(line, None, car) for line in payload.splitlines() if line.strip()]
+            return [row for row in rows if row is not None]
+        try:
+            found = json.loads(payload)
+        except (ValueError, RecursionError):
+            self._refused("corrupt")
+            return []
+        return [row for one in found if (row := self._of_object(one, None, car)) is not None]
+
+    def _of_json(self, text: bytes, position: int | None, car: str) -> Row | None:
+        try:
+            found = json.loads(text.decode())  # of bytes it would look for the encoding first
+        except (ValueError, RecursionError):
+            return self._refused("corrupt")
+        return self._of_object(found, position, car)
+
+    def _of_object(self, found: Any, position: int | None, car: str) -> Row | None:
+        if type(found) is not dict:
+            return self._refused("corrupt")
+        car = found.get("car", car)
+        if type(car) is not str:
+            if type(car) is not int:
+                return self._refused("corrupt")
+            car = str(car)
+        time = found.get(self._time)
+        if time is None:
+            return self._refused("incomplete")
+        # as false as text: a number in quotation marks is one that somebody meant to be a word
+        if type(time) not in (float, int) or not -1e15 < time < 1e15:
+            return self._refused("implausible")
+        signals = {name: found[column] for name, column in self._columns if column in found}
+        return self._made(car, float(time), signals, position)
+
+    def _of_csv(self, line: bytes, position: int | None) -> Row | None:
+        try:
+            cells = [cell.strip() for cell in next(csv.reader([line.decode("utf-8-sig")]))]
+        except (UnicodeDecodeError, csv.Error, StopIteration):
+            return self._refused("corrupt")
+        if self._header is None:
+            self._header = self._checked(cells)
+            return None
+        if cells == self._header:  # of a file begun again
+            return None
+        if len(cells) != len(self._header):
+            return self._refused("corrupt")
+        found = dict(zip(self._header, cells, strict=True))
+        time = _number(found.get(self._time, ""))
+        if time is None:
+            return self._refused("incomplete")
+        if not isinstance(time, float) or not -1e15 < time < 1e15:
+            return self._refused("implausible")
+        signals = {name: _number(found[column]) for name, column in self._columns if column in found}
+        return self._made(found.get("car") or self.car, time, signals, position)
+
+    def _checked(self, cells: list[str]) -> list[str]:
+        names = {name for name, column in self._columns if column in cells}
+        if self._time not in cells or "accel_cmd" not in names or not names & {"accel", "speed"}:
+            found = printable(", ".join(cells), 120)
+            raise InputError(
+                f"the source's first line: found {found}; needs a JSON object, or a CSV header with time, accel_cmd, "
+                "and accel or speed (--map names other columns)"
+            )
+        return cells
+
+    def _made(self, car: str, time: float, signals: dict[str, Any], position: int | None) -> Row | None:
+        if not car or len(car) > _CAR or not _is_text(car):
+            return self._refused("corrupt")
+        if self._factors:
+            return self._scaled(Row(car, time, signals, position))
+        return Row(car, time, signals, position)
+
+    def _scaled(self, row: Row) -> Row | None:
+        factors = self._factors
+        try:
+            signals: Mapping[str, Any] = {
+                name: value * factors[name] if name in factors and value is not None else value
+                for name, value in row.signals.items()
+            }
+        except (TypeError, OverflowError):  # an integer of four hundred digits is no float
+            return self._refused("implausible")
+        return row._replace(time=row.time * factors.get("time", 1.0), signals=signals)
+
+    def _refused(self, kind: str) -> None:
+        self.counts.refuse(kind)
+
+
+def _is_text(name: str) -> bool:
+    """Whether it can be written: JSON may hold half of a surrogate pair."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _number(text: str) -> float | str | None:
+    """A cell's number; None where it is empty, and the text itself where it is no number."""
+    if not text:
+        return None
+    try:
+        return numeral(text)
+    except ValueError:
+        return text

@@ -5,33 +5,189 @@
 - where the plant has a free form, `acceleration_map_path` of its model `DELAY_STEER_MAP_ACC_GEARED`: a table of the
   acceleration that follows a command (rows) at a speed (columns)
 - openpilot (`CarParams`): `longitudinalActuatorDelay` [s], from command to response, lag and all
-- SUMO's `vType` (`sumo.py`) and the pedals of CARLA (`carla.py`)
+- SUMO's `vType`: `accel` and `decel` [m/s²], the limits of acceleration and of braking that every car-following model
+  and every command by TraCI keeps to (`emergencyDecel`: the limit in an emergency); and a lag, `tauEngine` [s], which
+  acts in one model alone, `CC` of Plexe, under its controllers. Under all others, and under TraCI's `setAcceleration`,
+  a car has the acceleration that was asked for at the next step. `actionStepLength` is no lag and no delay: it is the
+  time between two decisions of the driver model, in which the last one is held, and commands by TraCI are not held at
+  all. `tau` is a time gap, `startupDelay` a driver's at a stop.
+- the pedals of CARLA's `VehicleControl`, throttle and brake from 0 to 1. CARLA's cars read no such table: what their
+  pedals do comes from a torque curve, gears, mass, drag and tyres (`VehiclePhysicsControl`), of which a log tells none
+  by itself. So the table says what the real car does; a controller that drives the model needs the same table of the
+  model, as `avtorch` makes it from a drive in CARLA.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from xml.etree import ElementTree
 
 import torch
 
-from avtorch.gap import FREE_FORMS, ForceTable, GapPlant, ResistanceCurve
+from avtorch.gap import FREE_FORMS, Effect, ForceTable, GapPlant, ResistanceCurve
 from avtorch.io import answer_set, atomic
-from avtorch.pedals import PedalMap
-from avtorch.remedy.carla import to_carla
-from avtorch.remedy.exported import OVERSHOOT, Exported, delay_of, delays_of, gain_lost, not_exported, overshoots
-from avtorch.remedy.sumo import to_sumo
+from avtorch.pedals import MapTable, PedalMap, accel_table, brake_table
+
+
+@dataclass(frozen=True)
+class Exported:
+    """`values` by the tool's own names; `lost`: properties of the plant that the tool cannot express, one sentence
+    each.
+    """
+
+    tool: str
+    values: Mapping[str, float]
+    lost: tuple[str, ...]
+
+    def to_text(self) -> str:
+        """YAML lines, with the lost properties as comments."""
+        lines = [f"# {self.tool}", *(f"# not expressed: {text}" for text in self.lost)]
+        return "\n".join([*lines, *(f"{name}: {value:.6g}" for name, value in self.values.items())]) + "\n"
+
+
+def not_exported(plant: GapPlant, reported: Collection[str] = ()) -> tuple[str, ...]:
+    """A sentence for each effect of `plant` but those `reported`, which are held or have a sentence already."""
+    return tuple(
+        f"{e.name}: {SENSOR if e.place == 'sensor' else e.meaning}" for e in plant.effects if e.name not in reported
+    )
+
+
+SENSOR = "the sensor's, not the car's"
+OVERSHOOT = "its overshoot; the time constant is that of the two poles together"
+
+
+def overshoots(effect: Effect) -> bool:
+    """Whether it makes the actuator one of second order."""
+    return "tau" in effect.actuator_parameters()
+
+
+def delays_of(plant: GapPlant) -> list[str]:
+    """Names of the effects that delay commands and do nothing else."""
+    return [e.name for e in plant.effects if e.shift is not None]
+
+
+def delay_of(plant: GapPlant) -> float:
+    """Total delay [s] that all effects add to the command."""
+    return sum((float(getattr(e, e.shift)) for e in plant.effects if e.shift is not None), 0.0)
+
+
+def gain_lost(plant: GapPlant, why: str) -> list[str]:
+    """A sentence on `K_L`, where it is not 1 to a hundredth."""
+    gain = float(plant.K_L)
+    return [f"K_L {gain:.3g}: {why}"] if abs(gain - 1) > 0.01 else []
+
+
+_NO_DELAY = "SUMO has no delay; actionStepLength is the time between two decisions of the driver model"
+_ELSEWHERE = "of Plexe's model CC alone; every other model and TraCI answer at the next step"
+_OWN = "no limit was found, so SUMO's default limits the car"
+
+
+@dataclass(frozen=True)
+class SumoType(Exported):
+    """A `vType`, in a file of additional elements."""
+
+    def to_text(self) -> str:
+        """XML, with the lost properties as comments."""
+        root = ElementTree.Element("additional")
+        for text in (self.tool, *(f"not expressed: {x}" for x in self.lost)):
+            root.append(ElementTree.Comment(f" {text} "))
+        # the model CC asks for the number of lanes
+        given = {"id": "car", "carFollowModel": "CC", "lanesCount": "1"}
+        ElementTree.SubElement(root, "vType", given | {k: f"{x:.6g}" for k, x in self.values.items()})
+        ElementTree.indent(root, "    ")
+        return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def to_sumo(plant: GapPlant) -> SumoType:
+    """Lag and limits of `plant`.
+
+    Example:
+        >>> from avtorch.gap import Saturation, plant
+        >>> from avtorch.remedy import to_sumo
+        >>> exported = to_sumo(plant([Saturation(1.5, -3.0)], baseline="dead_time=0.2", T_L=0.4))
+        >>> dict(exported.values)
+        {'tauEngine': 0.4, 'accel': 1.5, 'decel': 3.0, 'emergencyDecel': 3.0}
+        >>> [text.partition(":")[0] for text in exported.lost]
+        ['tauEngine', 'dead_time']
+    """
+    limits = [x for e in plant.effects if (x := e.accel_limits()) is not None]
+    most = min((high for _, high in limits), default=math.inf)
+    brake = min((-low for low, _ in limits), default=math.inf)
+    values = {"tauEngine": float(plant.T_L)}
+    lost = [f"tauEngine: {_ELSEWHERE}"]
+    if math.isfinite(most):
+        values["accel"] = most
+    else:
+        lost.append(f"accel: {_OWN}")
+    if math.isfinite(brake):
+        values |= {"decel": brake, "emergencyDecel": brake}
+    else:
+        lost.append(f"decel: {_OWN}")
+    lost += gain_lost(plant, "a car does what it is asked to, as far as its limits allow")
+    lost += [f"{name}: {_NO_DELAY}" for name in delays_of(plant)]
+    lost += [f"{e.name}: {OVERSHOOT}" for e in plant.effects if overshoots(e)]
+    held = [e.name for e in plant.effects if e.accel_limits() is not None or overshoots(e)]
+    return SumoType("SUMO vType", values, (*lost, *not_exported(plant, [*held, *delays_of(plant)])))
+
+
+_NO_LAG = "VehicleControl has neither; what the model has comes from its physics"
+_PHYSICS = "mass, drag_coefficient and torque_curve of VehiclePhysicsControl: a log of pedals does not tell them apart"
+
+
+@dataclass(frozen=True)
+class CarlaPedals(Exported):
+    """`tables` by the name of a pedal in `VehicleControl`."""
+
+    tables: Mapping[str, MapTable]
+
+    def to_text(self) -> str:
+        """YAML: for each pedal the acceleration [m/s²] by pedal (a line each) and speed [m/s], coasting included."""
+        lines = []
+        for name, table in self.tables.items():
+            lines += [f"{name}:", f"  speed: {_numbers(table.speed.tolist())}"]
+            rows = zip(table.pedal.tolist(), table.accel.tolist(), strict=True)
+            lines += [f"  {pedal:.6g}: {_numbers(accels)}" for pedal, accels in rows]
+        return super().to_text() + "\n".join(lines) + "\n"
+
+
+def to_carla(pedals: PedalMap, plant: GapPlant | None = None) -> CarlaPedals:
+    """The map `pedals` for throttle and brake; of the `plant`, which a diagnosis found behind them, only what is lost.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.gap import plant
+        >>> from avtorch.pedals import PedalMap, PedalTable
+        >>> from avtorch.remedy import to_carla
+        >>> throttle = PedalTable(np.array([0.0, 1.0]), np.array([[0, 0], [4.0, 2.0]]))
+        >>> made = PedalMap(np.array([0.0, 30.0]), np.array([0.0, -0.6]), {"throttle": throttle})
+        >>> told = to_carla(made, plant(baseline="dead_band=0.1"))
+        >>> list(told.tables), [text.partition(":")[0] for text in told.lost]
+        (['throttle'], ['lag 0.3 s and dead time 0 s', 'brake', 'physics', 'dead_band'])
+    """
+    given = {"throttle": accel_table(pedals), "brake": brake_table(pedals)}
+    tables = {name: table for name, table in given.items() if table is not None}
+    lag, late = (pedals.T_L, pedals.dead_time) if plant is None else (float(plant.T_L), delay_of(plant))
+    lost = [f"lag {lag:.3g} s and dead time {late:.3g} s: {_NO_LAG}"]
+    lost += [f"{name}: the log has none" for name, table in given.items() if table is None]
+    lost += dict.fromkeys(text for table in tables.values() for text in table.lost[1:])  # the first is the lag again
+    lost.append(f"physics: {_PHYSICS}")
+    if plant is not None:
+        lost += gain_lost(plant, "the tables hold K_L 1; multiply the accelerations")
+        lost += not_exported(plant, delays_of(plant))
+    return CarlaPedals("CARLA VehicleControl", {}, tuple(lost), tables)
+
+
+def _numbers(values: list[float]) -> str:
+    return "[" + ", ".join(f"{x:.4g}" for x in values) + "]"
+
 
 ACCELERATION_MAP = "plant.autoware.csv"
 FILES = ("plant.autoware.yaml", "plant.openpilot.yaml", "plant.sumo.xml", "plant.carla.yaml", ACCELERATION_MAP)
-"""Every file of an export.
-
-Example:
-    >>> from avtorch.remedy.exports import FILES
-    >>> [name.split(".")[1] for name in FILES]
-    ['autoware', 'openpilot', 'sumo', 'carla', 'autoware']
-"""
+"""Every file of an export."""
 
 _FAR_MPS2 = 10.0  # beyond what tyres hold
 
@@ -71,14 +227,6 @@ def to_autoware(plant: GapPlant) -> Exported:
 def acceleration_map(plant: GapPlant) -> str | None:
     """The plant's free form as Autoware's table: accelerations [m/s²] that follow commands (rows) [m/s²] at speeds
     (columns) [m/s], the gain and the resistance among them; None where it has none.
-
-    Example:
-        >>> from avtorch.gap import ForceTable, plant
-        >>> from avtorch.remedy.exports import acceleration_map
-        >>> print(acceleration_map(plant([ForceTable((0.0, 2.0), (0.0, 30.0), ((0.0, 0.0), (0.0, -1.0)))])), end="")
-        default,0,30
-        0,0,0
-        2,2,1
     """
     tables = [e for e in plant.effects if isinstance(e, ForceTable)]
     curves = [e for e in plant.effects if isinstance(e, ResistanceCurve)]

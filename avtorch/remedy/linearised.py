@@ -27,16 +27,6 @@ def linearised(
 
     `belief`: draws (draw,) of its parameters by the plant's names; without, its own values, and a batch of one. Drags
     and pushes are linearised at that speed, random effects and the road are left out.
-
-    Example:
-        >>> import torch
-        >>> from avtorch import stability
-        >>> from avtorch.gap import plant
-        >>> from avtorch.remedy import linearised
-        >>> car = linearised(plant(baseline="dead_time=0.4"), speed=20.0)
-        >>> verdict = stability.chain_verdict(car, torch.tensor([1.0]), torch.tensor([1.5, 1.5, -0.8]))
-        >>> verdict.string_stable.tolist(), verdict.peak_gain.round(decimals=2).tolist()
-        ([False], [1.75])
     """
     # the road is not a property of the car
     own = [e for e in plant.effects if not e.random and not isinstance(e, RoadGrade)]

@@ -10,7 +10,7 @@ Example:
 
 from avtorch.vehicle.black_box import Linearised, linearise, measured_gain
 from avtorch.vehicle.block import Block, Trajectory
-from avtorch.vehicle.controllers import NOMINAL_GAINS, Controller, FollowerState, LinearController
+from avtorch.vehicle.controllers import NOMINAL_GAINS, RAMP_RATE, Controller, FollowerState, LinearController, TimeGap
 from avtorch.vehicle.glvd import GLVD, exact_motion, glvd_jerk, glvd_rollout, glvd_step
 from avtorch.vehicle.leader import Leader
 from avtorch.vehicle.loop import ClosedLoop, simulate
@@ -19,7 +19,6 @@ from avtorch.vehicle.mpc import MPC
 from avtorch.vehicle.performance import Performance, equilibrium_throughput, performance
 from avtorch.vehicle.plant import GLVDPlant, Plant
 from avtorch.vehicle.second_order import PositionLag, SpeedLag
-from avtorch.vehicle.time_gap import RAMP_RATE, TimeGap
 
 __all__ = [
     "GLVD",

@@ -1,10 +1,16 @@
-"""Numbers and tensors as the vehicle takes them: checked once, on entry, then trusted in the hot loop."""
+"""Numbers and tensors as the vehicle takes them: checked once, on entry, then trusted in the hot loop.
+
+Broadcasting with types: torch declares none for it, and its own `broadcast_shapes` imports SymPy, which takes almost as
+long as torch itself.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TypeAlias, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -60,3 +66,16 @@ def _within(seen: Tensor, above: float | None, least: float | None) -> bool:
     low, high = cast(tuple[float, float], tuple(torch.stack(torch.aminmax(seen)).numpy(force=True)))
     finite = math.isfinite(low) and math.isfinite(high)
     return finite and (above is None or low > above) and (least is None or low >= least)
+
+
+def broadcast(*tensors: Tensor) -> tuple[Tensor, ...]:
+    """`tensors` expanded to the shape that they broadcast to; see `torch.broadcast_tensors`."""
+    return torch.broadcast_tensors(*tensors)  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+
+
+def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
+    """The shape that `shapes` broadcast to. Raises `RuntimeError` where there is none."""
+    try:
+        return torch.Size(np.broadcast_shapes(*(tuple(shape) for shape in shapes)))
+    except ValueError as error:
+        raise RuntimeError(str(error)) from None

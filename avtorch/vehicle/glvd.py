@@ -22,8 +22,7 @@ from torch import Tensor
 
 from avtorch.arrays import Float, Real
 from avtorch.errors import InputError
-from avtorch.vehicle.arguments import Batched, Number, checked, tensor
-from avtorch.vehicle.broadcasting import broadcast_shape
+from avtorch.vehicle.arguments import Batched, Number, broadcast_shape, checked, tensor
 
 Method = Literal["zoh", "euler"]
 

@@ -26,12 +26,9 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Float
-from avtorch.deprecation import deprecated, renamed
 from avtorch.errors import InputError
-from avtorch.vehicle.arguments import checked
-from avtorch.vehicle.broadcasting import broadcast
-from avtorch.vehicle.controllers import FollowerState
-from avtorch.vehicle.time_gap import RAMP_RATE, TimeGap
+from avtorch.vehicle.arguments import broadcast, checked
+from avtorch.vehicle.controllers import RAMP_RATE, FollowerState, TimeGap
 
 _ROUNDS = 20  # of the active set method; 3 to 6 are usual
 _ACCURACY = 1e-9  # relative error of the gradient iterations, by their guaranteed rate
@@ -59,7 +56,6 @@ class MPC:
         True
     """
 
-    @renamed(until="0.3", T="T_hat", K="K_hat")
     def __init__(
         self,
         *,
@@ -90,18 +86,6 @@ class MPC:
         self.T_hat, self.K_hat, self.horizon, self.weights = lag, gain, horizon, tuple(float(x) for x in q)
         self.ramp: TimeGap | None = None
         self._condense(moves, q)
-
-    @property
-    def T(self) -> float:
-        """`T_hat`, until 0.3."""
-        deprecated("MPC.T", "MPC.T_hat", until="0.3")
-        return self.T_hat
-
-    @property
-    def K(self) -> float:
-        """`K_hat`, until 0.3."""
-        deprecated("MPC.K", "MPC.K_hat", until="0.3")
-        return self.K_hat
 
     def _condense(self, moves: int, q: Float[Tensor, "4"]) -> None:
         tau, T, K, h = self.time_gap, self.T_hat, self.K_hat, self.step

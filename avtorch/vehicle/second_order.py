@@ -21,8 +21,7 @@ from torch import Tensor
 
 from avtorch.arrays import Float, Real
 from avtorch.errors import InputError
-from avtorch.vehicle.arguments import Number, checked
-from avtorch.vehicle.broadcasting import broadcast
+from avtorch.vehicle.arguments import Number, broadcast, checked
 from avtorch.vehicle.glvd import glvd_rollout
 
 

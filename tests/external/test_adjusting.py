@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from avtorch import ExternalSimulator, InputError, Leader, diagnose, simulate
 from avtorch.external.adjusting import Rollouts, adjusted
 from avtorch.external.driving import driven_along
-from avtorch.external.parameters import values_of, with_values
+from avtorch.external.simulator import values_of, with_values
 from avtorch.gap import DeadTime, plant
 from avtorch.io import Log
 

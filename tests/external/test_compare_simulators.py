@@ -11,8 +11,8 @@ import pytest
 from scipy.stats import binom
 
 from avtorch import ExternalSimulator, InputError, compare, compare_simulators
-from avtorch.external.driven_plant import DrivenPlant
-from avtorch.external.scored_blocks import LogRatio
+from avtorch.external.compare_simulators import LogRatio
+from avtorch.external.simulator import DrivenPlant
 from avtorch.external.simulator_comparison import OTHERS
 from avtorch.gap import plant
 from avtorch.io import Log

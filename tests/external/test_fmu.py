@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from avtorch import InputError
-from avtorch.external import FmuSimulator, Simulator, fmu_child
-from avtorch.external.side_by_side import side_by_side
+from avtorch.external import FmuSimulator, Simulator, fmu
+from avtorch.external.external_simulator import side_by_side
 from avtorch.io.mapping import read_mapping
 from tests.external import fmus
 
@@ -339,7 +339,7 @@ def test_a_failure_names_its_time_and_the_next_drive_is_a_new_one(
 
 def test_a_start_that_hangs_is_ended(build: Build, monkeypatch: pytest.MonkeyPatch) -> None:
     car = build.open(build.fmu()).with_parameters({"fault": fmus.HANG_AT_START})
-    monkeypatch.setattr(fmu_child, "OPENING_SECONDS", 0.4)
+    monkeypatch.setattr(fmu, "OPENING_S", 0.4)
     with pytest.raises(InputError, match=r"car\.fmu: before the first step: it does not answer within 0\.4 s$"):
         car.reset(speed=20.0, accel=0.0)
 

@@ -13,9 +13,8 @@ from scipy.integrate import solve_ivp
 
 from avtorch import ExternalSimulator, GLVDPlant, InputError, diagnose
 from avtorch.external import check_simulator, load_simulator, wrap
-from avtorch.external.discrepancy import discrepancy
-from avtorch.external.drives import drives_of
-from avtorch.external.driving import driven_along
+from avtorch.external.answer import discrepancy
+from avtorch.external.driving import driven_along, drives_of
 from avtorch.external.surrogate import surrogate_of
 from avtorch.gap import DeadTime, plant
 from avtorch.io import Log

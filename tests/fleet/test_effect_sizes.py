@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from avtorch.fleet.effect_sizes import drive_sizes, effect_sizes
+from avtorch.fleet.population import drive_sizes, effect_sizes
 from tests.bars import BAR
 
 

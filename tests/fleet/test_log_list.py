@@ -10,7 +10,7 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.fleet import find_logs, run_fleet
-from avtorch.fleet.places import content_hash, fetched
+from avtorch.fleet.log_list import content_hash, fetched
 from avtorch.io import answer_set, write_json
 from tests.fleet.drives import QUICK, drive, write_fleet
 

@@ -9,9 +9,7 @@ import pytest
 import torch
 from scipy import stats
 
-from avtorch.fleet.causes import car_causes, fleet_causes
-from avtorch.fleet.pooling import SAMPLED
-from avtorch.fleet.population import APART, drive_belief, population
+from avtorch.fleet.population import APART, SAMPLED, car_causes, drive_belief, fleet_causes, population
 from avtorch.fleet.siblings import left_out
 from avtorch.inference import PopulationMargin, sample
 from tests.bars import BAR

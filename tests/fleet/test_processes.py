@@ -19,16 +19,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from avtorch import diagnose
 from avtorch.cli import main
-from avtorch.fleet import FleetLog, FleetSettings, read_rows, run_fleet
+from avtorch.fleet import read_rows, run_fleet
 from avtorch.fleet.cluster import ATTEMPTS, Cluster
-from avtorch.fleet.places import content_hash
-from avtorch.fleet.run import checkpoint_name
-from avtorch.fleet.task import Task
-from avtorch.io import Log
 from tests.fleet.drives import QUICK, write_fleet
-from tests.overridden import taken_over
 
 ROOT = Path(__file__).resolve().parents[2]
 LAGS = {f"car{i}": 0.3 + 0.05 * i for i in range(6)}
@@ -120,35 +114,6 @@ def test_a_log_that_ends_every_worker_becomes_a_row_and_the_others_are_done(tmp_
     assert errors == {car: {} for car in LAGS}
     status = {row["car"]: row["status"] for row in read_rows(tmp_path / "out", "checks").to_pylist()}
     assert status == {"large": "crashed", **dict.fromkeys(LAGS, "done")}
-
-
-@pytest.mark.slow
-@pytest.mark.statistical
-def test_a_diagnosis_goes_on_from_what_a_killed_worker_had_finished(tmp_path: Path, rotating_seed: int) -> None:
-    log = tmp_path / "late.csv"
-    taken_over(seconds=40.0, overrides=(), rng=np.random.default_rng(rotating_seed), delay_s=0.3).write(log)
-    settings = FleetSettings(steps=("diagnose",), effects=("dead_time", "sensor_bias"), posterior="laplace")
-    sha256, size = content_hash(log)
-    name = f"diagnose-{Path(FleetLog(str(log), '').file_name).stem}"
-    for given in (settings, replace(settings, pairs=False)):
-        task = Task(name, "diagnose", str(log), sha256, size, given)
-        kept = tmp_path / "out" / "unfinished" / checkpoint_name(task)
-        kept.parent.mkdir(parents=True, exist_ok=True)
-
-        def stop(what: str, done: int, of: int, kept: Path = kept) -> None:
-            if kept.exists():
-                raise KeyboardInterrupt
-
-        with pytest.raises(KeyboardInterrupt):
-            diagnose(Log.read(log), effects=given.effects, pairs=given.pairs, progress=stop, checkpoint=kept)
-        assert kept.exists()
-    answer = run_fleet(log, tmp_path / "out", settings=settings, workers=1)
-    assert answer["failed_logs"] == 0
-    assert not (tmp_path / "out" / "unfinished").exists()
-    # by a worker of the same kind: sums in two threads differ in the last digit from those in one
-    run_fleet(log, tmp_path / "undisturbed", settings=settings, workers=1)
-    own, whole = (read_rows(tmp_path / name, "diagnoses").drop_columns(["seconds"]).to_pylist() for name in NAMES)
-    assert own == whole
 
 
 @pytest.fixture

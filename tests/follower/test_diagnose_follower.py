@@ -18,8 +18,7 @@ from avtorch.follower import (
     loop_errors,
     loop_stability,
 )
-from avtorch.follower.followed import followed
-from avtorch.follower.identify import identified, widened
+from avtorch.follower.identify import followed, identified, widened
 from avtorch.io import Log
 from avtorch.vehicle.stability import local_stable, peak_gain, string_stable
 from tests.follower.loops import CTG, DELAY, DT, IDM, T_L, followed_log

@@ -33,8 +33,7 @@ from avtorch.errors import InputError, quoted
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.effect_context import EffectContext, context_at
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.vehicle.arguments import Number, tensor
-from avtorch.vehicle.broadcasting import broadcast
+from avtorch.vehicle.arguments import Number, broadcast, tensor
 
 Place = Literal["command", "actuator", "body", "sensor"]
 PLACES: tuple[Place, ...] = ("command", "actuator", "body", "sensor")

@@ -18,7 +18,7 @@ from avtorch.gap.simulator.actuator import ActuatorState
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.order import actuator_of, at_place, substeps
-from avtorch.vehicle.noise import Noise
+from avtorch.vehicle.loop import Noise
 from avtorch.vehicle.plant import Motion
 
 ROUNDS = 5

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Complex, Float, Inexact
 from avtorch.errors import InputError
-from avtorch.vehicle.broadcasting import broadcast
+from avtorch.vehicle.arguments import broadcast
 
 SLACK = 1e-4
 """A gain above one by less than this counts as one: the error of responses measured on a grid."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
-from avtorch.vehicle.broadcasting import broadcast
+from avtorch.vehicle.arguments import broadcast
 from avtorch.vehicle.stability.linear_loop import Gains, LinearLoop, Value, linear_loop
 
 Form = Literal["rigorous", "print"]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float
-from avtorch.vehicle.broadcasting import broadcast
+from avtorch.vehicle.arguments import broadcast
 from avtorch.vehicle.stability.linear_loop import Gains, LinearLoop, Value, linear_loop
 
 # Rounding must not make a loop on the boundary (C = 0 on paper) unstable: the sums below have some ten roundings.

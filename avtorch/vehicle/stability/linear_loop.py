@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Real
 from avtorch.errors import InputError
-from avtorch.vehicle.broadcasting import broadcast_shape
+from avtorch.vehicle.arguments import broadcast_shape
 
 Value = float | Sequence[float] | Real[Tensor, "*#setting"]
 Gains = Sequence[float] | Real[Tensor, "*#setting 3"]

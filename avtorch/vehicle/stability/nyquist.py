@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float
-from avtorch.vehicle.broadcasting import broadcast
+from avtorch.vehicle.arguments import broadcast
 from avtorch.vehicle.stability.linear_loop import LinearLoop
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Complex, Float
-from avtorch.vehicle.broadcasting import broadcast
+from avtorch.vehicle.arguments import broadcast
 from avtorch.vehicle.stability.linear_loop import Gains, LinearLoop, Value, as_tensor, linear_loop
 
 
