@@ -208,11 +208,6 @@ def _picked(density: Density, index: Tensor) -> Density:
     return density
 
 
-def exactness(density: Density, z: Float[Tensor, "chain draw window parameter"], points: int) -> Exactness:
-    """The same with ``points`` points, once."""
-    return weighed(density, Moments.of(z), points)
-
-
 class Moments(NamedTuple):
     """Moments of draws: ``lower`` ``(window, parameter, parameter)``, the rest ``(window, parameter)``.
 
