@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference.excitation import ExcitationRule
+from avtorch.inference.form import ExcitationRule
 from avtorch.inference.jerk import JerkDensity
 from avtorch.inference.priors import Prior
 from avtorch.inference.sampler import sample

@@ -262,12 +262,6 @@ class Monitor:
         for chart in self._charts.values():
             chart.restart(where)
 
-    def set_baseline(self, T_L: Tensor, K_L: Tensor) -> None:
-        """Set a baseline posterior from another source (an earlier drive): draws (scenario, draw) or (draw,)."""
-        given = self._gaussian(T_L.to(torch.float64), K_L.to(torch.float64))
-        self._baseline = Gaussian(given.mean.expand(self.scenarios, 2), given.cov.expand(self.scenarios, 2, 2))
-        self._has_baseline = torch.ones(self.scenarios, dtype=torch.bool)
-
     def state_dict(self) -> dict[str, Any]:
         """The whole state that later updates depend on, as tensors and dicts of tensors."""
         return {

@@ -99,18 +99,6 @@ class Setting:
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
 
-    def where(self, condition: Tensor, other: Setting) -> Setting:
-        """This setting where `condition` (scenario,) holds, `other` elsewhere."""
-        parts: dict[str, Any] = {
-            f.name: torch.where(
-                condition.unsqueeze(-1) if f.name == "gains" else condition,
-                getattr(self, f.name),
-                getattr(other, f.name),
-            )
-            for f in fields(self)
-        }
-        return Setting(**parts)
-
     def __getitem__(self, index: Any) -> Setting:
         """Some of the scenarios, by index tensor, mask or slice."""
         return Setting(**{f.name: getattr(self, f.name)[index] for f in fields(self)})

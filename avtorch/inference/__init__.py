@@ -18,8 +18,7 @@ from avtorch.inference.density import (
     SelectableDensity,
     SubsampledDensity,
 )
-from avtorch.inference.excitation import ExcitationRule
-from avtorch.inference.form import Form, JerkForm, WindowLikelihood
+from avtorch.inference.form import ExcitationRule, Form, JerkForm, WindowLikelihood
 from avtorch.inference.jerk import JerkDensity, JerkPoints, JerkStatistics, jerk_log_likelihood
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.population import PopulationMargin

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
 from types import ModuleType
+from typing import Literal
 
 import numpy as np
 import torch
@@ -16,12 +19,33 @@ from avtorch.errors import InputError
 from avtorch.inference.coordinates import Coordinates
 from avtorch.inference.density import Density
 from avtorch.inference.exponential_form import ExponentialForm, has_form, outdated
-from avtorch.inference.kernel_loading import Unavailable, load_kernels
 from avtorch.inference.planes import empty_planes, to_planes
 from avtorch.inference.sampler_settings import SamplerSettings
 
 #: Steps of single chains below which a second thread costs more than it saves, some milliseconds of work.
 ALONE = 500_000
+
+
+@dataclass(frozen=True)
+class Unavailable:
+    """Why something is not compiled."""
+
+    why: str
+
+
+@cache
+def load_kernels(module: Literal["kernels", "latent_kernels"]) -> ModuleType | Unavailable:
+    """A module of compiled code, from numba's cache on disk; a machine's first call compiles it and fills the cache."""
+    import numba
+
+    if numba.config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
+        return Unavailable("numba does not compile here: NUMBA_DISABLE_JIT is set")
+    try:
+        return import_module(f"avtorch.inference.{module}")
+    except RuntimeError as fault:  # numba found no folder to write to; without one every process would compile anew
+        return Unavailable(
+            f"compiled code cannot be kept: {fault}; set NUMBA_CACHE_DIR to a folder that can be written"
+        )
 
 
 @dataclass(frozen=True)

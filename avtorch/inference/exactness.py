@@ -7,6 +7,8 @@ proposal``. If the ratios are reliable (Pareto-k, :mod:`avtorch.inference.pareto
 posterior's, with a Monte Carlo error that is known, and those of the draws are compared with them. If the ratios are
 not reliable, the draws do not cover the density, or its shape is too far from normal for this test: then nothing is
 claimed.
+
+A mode that no chain has reached is searched for by ascents of the density that start far from the draws.
 """
 
 from __future__ import annotations
@@ -21,10 +23,11 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
 from avtorch.inference.compiled import Compiled, Unavailable, compiled
+from avtorch.inference.coordinates import score_of
 from avtorch.inference.density import Density, has_selection
-from avtorch.inference.other_modes import missed_mass
+from avtorch.inference.map import find_mode
 from avtorch.inference.pareto import RELIABLE, pareto_k
-from avtorch.inference.planes import from_planes, lower_times, to_planes
+from avtorch.inference.planes import from_planes, lower_times, lower_transposed_times, to_planes
 
 MEAN_TOLERANCE, SD_TOLERANCE, TAIL_TOLERANCE = 0.1, 0.05, 0.003
 """Tolerances: error of a mean in SDs, of an SD as a ratio, of the share of draws beyond TAIL as a probability."""
@@ -45,6 +48,15 @@ SCALES, SHARES = (1.0, 1.5, 3.0, 6.0, 15.0), (0.45, 0.27, 0.14, 0.09, 0.05)
 AGAIN = 8
 #: Points times windows at once.
 BLOCK = 2**18
+#: Distances of the starts in SDs of the draws, evenly spaced; these are half of them, the others are mirror images.
+RADII = (4.0, 16.0)
+STARTS, STEPS = 16, 3
+#: Longest step of the climb, in the same SDs.
+STRIDE = 10.0
+#: Nats below the draws' centre, and SDs away from it, at which an end point is searched for a mode.
+DEPTH, FAR = 7.0, 5.0
+#: Share of the posterior's mass (by Laplace) from which a mode must not be missed.
+MASS = 0.005
 
 
 @dataclass(frozen=True)
@@ -196,11 +208,6 @@ def _picked(density: Density, index: Tensor) -> Density:
     return density
 
 
-def exactness(density: Density, z: Float[Tensor, "chain draw window parameter"], points: int) -> Exactness:
-    """The same with ``points`` points, once."""
-    return weighed(density, Moments.of(z), points)
-
-
 class Moments(NamedTuple):
     """Moments of draws: ``lower`` ``(window, parameter, parameter)``, the rest ``(window, parameter)``.
 
@@ -322,3 +329,50 @@ def proposal(points: int, d: int) -> tuple[Float[Tensor, "point d"], Float[Tenso
     parts = share - 0.5 * square / scales.square() - d * scales.log() - 0.5 * d * math.log(2 * math.pi)
     # the memory order in which the sums over points run
     return from_planes(x.mT.contiguous()[:, None]).squeeze(1), parts.logsumexp(-1)
+
+
+def missed_mass(
+    density: Density, mean: Float[Tensor, "window parameter"], lower: Float[Tensor, "window parameter parameter"]
+) -> Float[Tensor, " window"]:
+    """Mass of the heaviest mode found far from the draws, over that at the draws, ``(window,)``; 0 where none was.
+
+    Args:
+        mean, lower: the draws' mean ``(window, parameter)`` and triangular root of their covariance.
+    """
+    w = starts(mean.shape[-1]).to(mean.device)[:, None].expand(-1, len(mean), -1)
+    try:
+        for _ in range(STEPS):
+            slope = lower_transposed_times(lower, score_of(density, lower_times(lower, w) + mean))
+            w = w + slope * (STRIDE / slope.square().sum(-1, keepdim=True).sqrt_()).clamp_max_(1.0)
+        w = w.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+        with torch.no_grad():
+            end = lower_times(lower, w) + mean
+            height = density.log_prob(torch.cat([mean[None], end]))
+    except ValueError:  # a user's function that raises this far out: no search ends there
+        return mean.new_zeros(len(mean))
+    high = (w.square().sum(-1) > FAR**2) & (height[1:] > height[:1] - DEPTH)
+    missed = mean.new_zeros(len(mean))
+    index = high.any(0).nonzero().squeeze(-1)
+    if not len(index) or not (has_selection(density) or len(mean) == 1):
+        return missed
+    best = height[1:].masked_fill(~high, -torch.inf).argmax(0)[index]
+    chosen = density.select(index) if has_selection(density) and len(index) < len(mean) else density
+    other = find_mode(chosen, start=end[best, index])
+    away = torch.linalg.solve_triangular(lower[index], (other.z - mean[index])[..., None], upper=False)[..., 0]
+    volume = (other.scale.diagonal(dim1=-2, dim2=-1).abs().log() - lower[index].diagonal(dim1=-2, dim2=-1).log()).sum(
+        -1
+    )
+    # a skewed posterior's own mode lies near its draws; the density at their centre replaces it
+    ratio = (other.log_prob - height[0, index] + volume).exp()
+    there = other.converged & (away.norm(dim=-1) > FAR) & (ratio > MASS)
+    return missed.index_put((index,), torch.where(there, ratio, 0.0))
+
+
+@lru_cache(maxsize=32)
+def starts(d: int) -> Float[Tensor, "start d"]:
+    """``(start, d)``: directions at random but always the same, and their mirror images, at rising radii."""
+    half = STARTS // 2
+    direction = torch.randn(half, d, dtype=torch.float64, generator=torch.Generator().manual_seed(100 + d))
+    radius = torch.linspace(math.log(RADII[0]), math.log(RADII[1]), half, dtype=torch.float64).exp()
+    direction = direction / direction.norm(dim=-1, keepdim=True) * radius[:, None]
+    return torch.cat([direction, -direction])

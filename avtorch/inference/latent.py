@@ -11,7 +11,7 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
-from avtorch.inference.kernel_loading import Unavailable, load_kernels
+from avtorch.inference.compiled import Unavailable, load_kernels
 from avtorch.inference.latent_model import ACCEL_SD0, SPEED_SD0, latent_log_likelihood
 from avtorch.inference.latent_window import LatentWindow
 from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior, prior_on
@@ -100,7 +100,7 @@ def compiled_log_likelihood(
     six = (T_L, K_L, process_noise, zero if road_noise is None else road_noise, coloured_sd, coloured_time)
     two = (zero if x is None else x.square() for x in (speed_noise, accel_noise))
     given = torch.stack((*six, *two)).reshape(8, -1, T_L.shape[-1]).movedim(-1, 0).cpu().contiguous().numpy()
-    rows = runs.to("cpu")
+    rows = runs if device.type == "cpu" else runs.to("cpu")
     speed = None if speed_noise is None or rows.speed is None else (rows.speed - rows.speed[:, :1]).numpy()
     accel = None if accel_noise is None or rows.accel is None else rows.accel.numpy()
     time, u, none = rows.time.numpy(), rows.u.numpy(), np.empty(0)

@@ -137,11 +137,10 @@ def between(posterior: Posterior, other: Posterior) -> Agreement:
 
     Example:
         >>> import torch
-        >>> from avtorch.inference import sample, sample_conjugate
+        >>> from avtorch.inference import sample
         >>> from avtorch.validation import between, synthetic_windows
         >>> density = synthetic_windows(1, seed=1).density
-        >>> posterior = sample(density, generator=torch.Generator().manual_seed(0))
-        >>> other = sample_conjugate(density, generator=torch.Generator().manual_seed(0)).posterior
+        >>> posterior, other = (sample(density, generator=torch.Generator().manual_seed(s)) for s in (0, 1))
         >>> bool((between(posterior, other).mean_difference.abs() < 0.2).all())
         True
     """

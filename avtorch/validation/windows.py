@@ -10,8 +10,7 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.inference.density import Density, SelectableDensity
-from avtorch.inference.excitation import ExcitationRule
-from avtorch.inference.form import Form, JerkForm
+from avtorch.inference.form import ExcitationRule, Form, JerkForm
 from avtorch.inference.jerk import JerkDensity, JerkStatistics
 from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior

@@ -25,7 +25,7 @@ from avtorch.inference import (
     integrate,
     sample,
 )
-from avtorch.inference.exactness import exactness
+from avtorch.inference.exactness import Moments, weighed
 from avtorch.inference.pareto import pareto_k
 from avtorch.inference.posterior import effective_sample_size, normal_scores
 from avtorch.inference.sgld import harmonic
@@ -182,7 +182,7 @@ def test_moments_of_the_density_are_those_of_quadrature(make_windows, rotating_s
     mode = find_mode(density)
     truth = integrate(density, mode=mode)
     found = sample(density, generator=generator(rotating_seed), mode=mode)
-    seen = exactness(density, found.draws.log(), 8192)
+    seen = weighed(density, Moments.of(found.draws.log()), 8192)
     assert (seen.pareto_k < 0.7).all()
     assert seen.known().all()
     # quadrature's own nodes are over the logarithms
