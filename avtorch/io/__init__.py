@@ -17,11 +17,10 @@ from avtorch.io.atomic import atomic
 from avtorch.io.fingerprint import fingerprint
 from avtorch.io.folder_lock import sole_use
 from avtorch.io.following import read_following
+from avtorch.io.leaders import RawLeader, read_leader
 from avtorch.io.log import STANDSTILL_MPS, Log
 from avtorch.io.merge import held
 from avtorch.io.quality import Gap, Quality, check
-from avtorch.io.raw_leader import RawLeader
-from avtorch.io.recordings import read_leader
 from avtorch.io.sealed import Damaged, Sealed, read_sealed, read_sealed_bytes, write_sealed
 from avtorch.io.source import LogSource, as_log, as_logs
 

@@ -12,16 +12,13 @@ from numpy.typing import NDArray
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError, listed, printable, quoted
-from avtorch.io.bad_rows import MOST_BAD, BadRows, disordered
-from avtorch.io.clock import clock_words, since, since_start
+from avtorch.io.clock import clock_words, gap_limit, median_step, since, since_start
 from avtorch.io.mapping import PEDALS, SIGNALS, SignalMap
-from avtorch.io.merge import held
-from avtorch.io.merged import Arrivals
-from avtorch.io.segments import gap_limit, median_step
+from avtorch.io.merge import Arrivals, held
 from avtorch.io.tables import Table, read_table
 from avtorch.io.unit_names import stated_unit
 from avtorch.io.units import to_si
-from avtorch.io.validity import check_range, check_rate, check_time, off_clock, stray
+from avtorch.io.validity import MOST_BAD, BadRows, check_range, check_rate, check_time, disordered, off_clock, stray
 
 _NAME = 40  # characters of the longest column name that may be a signal's, mistyped
 # change of speed that an accelerometer in order notices: 1 m/s, and a tenth of the speed of what is slower

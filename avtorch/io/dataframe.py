@@ -9,9 +9,8 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from avtorch.errors import InputError, printable, quoted
-from avtorch.io.arrow_cells import cells_of, scalar_checks
-from avtorch.io.tables import Table
-from avtorch.io.whole_stamps import with_whole_stamps
+from avtorch.io.arrow_cells import cells_of, is_text, scalar_checks
+from avtorch.io.tables import Table, with_whole_stamps
 
 _INDEX = "__index_level_0__"  # pandas' own name for an index without one
 
@@ -58,17 +57,13 @@ def frame_table(frame: DataFrame, source: str = "DataFrame") -> Table:
     except (pa.ArrowException, TypeError, ValueError, RuntimeError, NotImplementedError) as fault:
         reason = str(fault).splitlines()[0] if str(fault) else type(fault).__name__
         raise InputError(f"{source}: no columns of numbers can be read from it ({printable(reason, 120)})") from None
-    names = list(table.column_names)
-    if _INDEX in names and "time" not in names and _is_time(table.column(_INDEX).type):
+    names = [str(name) for name in table.column_names]
+    if _INDEX in names and "time" not in names and _is_time(table.column(names.index(_INDEX)).type):
         names[names.index(_INDEX)] = "time"
-    cells = [
-        _cells(table.column(i), f"{source}: column {quoted(str(name))}") if _readable(table.column(i).type) else None
-        for i, name in enumerate(names)
-    ]
-    kept = [i for i, column in enumerate(cells) if column is not None]
-    form = f"a {type(frame).__name__}"
-    both = with_whole_stamps(tuple(str(names[i]) for i in kept), tuple(cells[i] for i in kept))
-    return Table(source, *both, form=form)
+    kept = [i for i in range(len(names)) if _readable(table.column(i).type)]
+    cells = tuple(cells_of(table.column(i), f"{source}: column {quoted(names[i])}") for i in kept)
+    both = with_whole_stamps(tuple(names[i] for i in kept), cells)
+    return Table(source, *both, form=f"a {type(frame).__name__}")
 
 
 def _interchanged(frame: DataFrame) -> Any:
@@ -88,13 +83,4 @@ def _readable(kind: Any) -> bool:
 
     if types.is_dictionary(kind):
         kind = kind.value_type
-    texts = (types.is_string, types.is_large_string, *filter(None, (getattr(types, "is_string_view", None),)))
-    return any(check(kind) for check in (*texts, *scalar_checks()))
-
-
-def _cells(column: Any, where: str) -> Any:
-    """A whole column: its chunks behind one another."""
-    import pyarrow as pa
-
-    joined = column.combine_chunks()
-    return cells_of(pa.concat_arrays(joined.chunks) if isinstance(joined, pa.ChunkedArray) else joined, where)
+    return is_text(kind) or any(check(kind) for check in scalar_checks())

@@ -10,10 +10,9 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed
-from avtorch.io import i24, openacc
+from avtorch.io.leaders import NO_LEADER_M, numbered, recorded, vehicle_order
 from avtorch.io.log import Log
 from avtorch.io.mapping import Pairs
-from avtorch.io.recorded_columns import recorded
 from avtorch.io.tables import Table, read_table
 
 _LONG_STEP_S = 0.25
@@ -53,14 +52,14 @@ def read_following(
     columns: dict[str, object] = {"map": map or None, "unit": unit or None, "stamp": stamp or None}
     if any(n.startswith("SpeedDoppler") for n in names):
         _idle(table.source, event=event, **columns)
-        numbers = openacc.numbered("SpeedDoppler", names)
+        numbers = numbered("SpeedDoppler", names)
         own = _chosen(table.source, vehicle, [n for n in numbers if n - 1 in numbers and f"Spacing{n}" in names])
         return _log(table, f"SpeedDoppler{own}", f"Spacing{own}", f"SpeedDoppler{own - 1}", f"vehicle {own}")
-    if "Time" in names and openacc.numbered("Speed", names):
+    if "Time" in names and numbered("Speed", names):
         _idle(table.source, event=event, **columns)
-        numbers = openacc.numbered("Speed", names)
+        numbers = numbered("Speed", names)
         own = _chosen(table.source, vehicle, [n for n in numbers if n - 1 in numbers and f"IVS{n - 1}" in names])
-        makes = openacc.vehicle_order(Path(path))
+        makes = vehicle_order(Path(path))
         make = f" ({makes[own - 1]})" if own <= len(makes) else ""
         return _log(table, f"Speed{own}", f"IVS{own - 1}", f"Speed{own - 1}", f"vehicle {own}{make}")
     if {"Time", "Velocity", "SpaceGap", "RelativeVelocity"} <= names:
@@ -103,7 +102,7 @@ def _instrumented(table: Table) -> Log:
     speed = table.numbers("Velocity", empty_is_nan=True) / 3.6
     gap = table.numbers("SpaceGap", empty_is_nan=True)
     lead = speed + table.numbers("RelativeVelocity", empty_is_nan=True)
-    gap = np.where(gap >= i24.NO_LEADER_M, np.nan, gap)
+    gap = np.where(gap >= NO_LEADER_M, np.nan, gap)
     return _whole(Path(table.source).stem, table.numbers("Time"), speed, gap, lead)
 
 

@@ -18,14 +18,13 @@ from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError, quoted
 from avtorch.io.assemble import assemble
 from avtorch.io.atomic import atomic
-from avtorch.io.clock import since_start
+from avtorch.io.clock import median_step, since_start, stretches
 from avtorch.io.dataframe import DataFrame, frame_table
 from avtorch.io.engagement import settled_rows
 from avtorch.io.formats import is_recording, open_recording
 from avtorch.io.mapping import PEDALS, SIGNALS, Pairs, SignalMap, given_mapping, pairs, read_mapping
-from avtorch.io.merged import Arrivals, merged
+from avtorch.io.merge import Arrivals, merged
 from avtorch.io.opening import place
-from avtorch.io.segments import median_step, stretches
 from avtorch.io.tables import Table, read_table
 from avtorch.io.units import SI
 from avtorch.io.validity import check_units

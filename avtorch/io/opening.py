@@ -6,8 +6,18 @@ import errno
 import os
 import stat
 from pathlib import Path
+from typing import BinaryIO
 
 from avtorch.errors import InputError, printable
+
+MOST_BYTES = 512 * 2**20
+"""Maximum size of a file."""
+
+MOST_COLUMNS = 10_000
+
+MOST_CELLS = 20_000_000
+"""Maximum of the used columns: seven hours of four signals at 200 Hz, about 1.3 GB while they are read."""
+
 
 _KINDS = {
     stat.S_IFLNK: "a symbolic link",
@@ -34,12 +44,11 @@ def place(path: str | os.PathLike[str]) -> str:
     return printable(os.fspath(path), _PATH)
 
 
-def read_regular(path: str | os.PathLike[str], *, most: int, need: str, links: bool = True) -> bytes:
-    """The content of a regular file of up to `most` bytes; `need` names the expected file in messages.
+def opened(path: str | os.PathLike[str], *, need: str, links: bool = True) -> BinaryIO:
+    """A regular file, open for reading bytes; the caller closes it. `need` names the expected file in messages.
 
     The checks look at the opened file, so it cannot be exchanged in between, and opening never waits: a pipe without a
-    writer, a device or a directory is refused at once. `links` False refuses a symbolic link too. Raises InputError,
-    for more bytes `TooLarge`.
+    writer, a device or a directory is refused at once. `links` False refuses a symbolic link too. Raises InputError.
     """
     shown = place(path)
     # O_NONBLOCK: a pipe would wait for its writer; both flags are missing on Windows, where neither is needed
@@ -55,25 +64,40 @@ def read_regular(path: str | os.PathLike[str], *, most: int, need: str, links: b
     except (OSError, ValueError) as fault:
         raise InputError(f"{shown}: {_why(path, fault, links)}; {need} is needed") from None
     try:
-        info = os.fstat(handle)
-        if not stat.S_ISREG(info.st_mode):
-            raise InputError(f"{shown}: is {kind_of(info.st_mode)}; {need} is needed")
-        # some files of the system say that they hold nothing: what is read counts, not what is said
-        raw = b"" if info.st_size > most else _read(handle, most + 1)
-    except OSError as fault:
-        raise InputError(f"{shown}: cannot be read ({fault.strerror or type(fault).__name__})") from None
-    finally:
+        mode = os.fstat(handle).st_mode
+        if not stat.S_ISREG(mode):
+            raise InputError(f"{shown}: is {kind_of(mode)}; {need} is needed")
+        return os.fdopen(handle, "rb")
+    except BaseException:
         os.close(handle)
-    size = max(info.st_size, len(raw))
-    if size > most:
-        raise TooLarge(f"{shown}: has {size:,} bytes; needs {most:,} at most")
+        raise
+
+
+def beginning(path: str | os.PathLike[str], count: int, *, need: str) -> bytes:
+    """The first `count` bytes of a regular file, fewer where it is shorter. Raises InputError."""
+    with opened(path, need=need) as stream:
+        return stream.read(count)
+
+
+def read_regular(path: str | os.PathLike[str], *, most: int, need: str, links: bool = True) -> bytes:
+    """The content of a regular file of up to `most` bytes, opened as by `opened`. Raises InputError, for more bytes
+    `TooLarge`."""
+    with opened(path, need=need, links=links) as stream:
+        try:
+            size = os.fstat(stream.fileno()).st_size
+            # some files of the system say that they hold nothing: what is read counts, not what is said
+            raw = b"" if size > most else _read(stream, most + 1)
+        except OSError as fault:
+            raise InputError(f"{place(path)}: cannot be read ({fault.strerror or type(fault).__name__})") from None
+    if max(size, len(raw)) > most:
+        raise TooLarge(f"{place(path)}: has {max(size, len(raw)):,} bytes; needs {most:,} at most")
     return raw
 
 
-def _read(handle: int, most: int) -> bytes:
+def _read(stream: BinaryIO, most: int) -> bytes:
     """Up to `most` bytes, in pieces, so that memory is allocated only for what is there."""
     pieces, left = [], most
-    while left > 0 and (piece := os.read(handle, min(left, 2**20))):
+    while left > 0 and (piece := stream.read(min(left, 2**20))):
         pieces.append(piece)
         left -= len(piece)
     return b"".join(pieces)

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.errors import InputError, listed
-from avtorch.io.clock import clock_words
+from avtorch.io.clock import clock_words, median_step, stretches
 from avtorch.io.consistency import line_between, scale_between
 from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import Log
 from avtorch.io.mapping import PEDALS
-from avtorch.io.segments import median_step, stretches
 from avtorch.io.validity import DELAYS_S, command_scale
 
 LEAST_S = 2.0

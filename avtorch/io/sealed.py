@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 import re
 import stat
@@ -107,10 +106,7 @@ def read_sealed(path: Path, *, schema: str, most: int = MOST, remedy: str = REME
         >>> read_sealed(Path("fit.json"), schema="fit/1").content["T_L"]
         0.3
     """
-    rest = _verified(path, schema, most, remedy)
-    found = _parsed(b"{" + rest, path, remedy)
-    if not isinstance(found, dict) or set(found) != {"of", "content"} or not isinstance(found["of"], dict):
-        _refuse(path, f"is no {schema} inside", remedy)
+    found = _parsed(b"{" + _verified(path, schema, most, remedy), path, schema, "content", remedy)
     return Sealed(found["of"], found["content"])
 
 
@@ -125,26 +121,21 @@ def read_sealed_bytes(path: Path, *, schema: str, most: int = MOST, remedy: str 
         b'weights'
     """
     line, _, content = _verified(path, schema, most, remedy).partition(b"\n")
-    found = _parsed(b"{" + line, path, remedy)
-    if not isinstance(found, dict) or set(found) != {"of", "bytes"} or not isinstance(found["of"], dict):
-        _refuse(path, f"is no {schema} inside", remedy)
+    found = _parsed(b"{" + line, path, schema, "bytes", remedy)
     if found["bytes"] != len(content):
         _refuse(path, f"holds {len(content)} bytes, not the {str(found['bytes'])[:20]} it names", remedy)
     return Sealed(found["of"], content)
 
 
-def _content(path: Path, most: int, remedy: str) -> bytes:
+def _verified(path: Path, schema: str, most: int, remedy: str) -> bytes:
+    """What follows the first line, once the checksum is found right."""
     try:
-        return read_regular(path, most=most, need="a regular file", links=False)
+        raw = read_regular(path, most=most, need="a regular file", links=False)
     except TooLarge:
         _refuse(path, f"is larger than {most / 2**20:.0f} MiB, which no file of its kind is", remedy)
     except InputError as fault:
         raise InputError(f"{fault}; {remedy}") from None
-
-
-def _verified(path: Path, schema: str, most: int, remedy: str) -> bytes:
-    """What follows the first line, once the checksum is found right."""
-    first, newline, rest = _content(path, most, remedy).partition(b"\n")
+    first, newline, rest = raw.partition(b"\n")
     match = _FIRST.fullmatch(first)
     if not match or not newline:
         _refuse(path, "is damaged, or from an earlier avtorch that wrote no checksum", remedy)
@@ -156,32 +147,21 @@ def _verified(path: Path, schema: str, most: int, remedy: str) -> bytes:
 
 
 def _checksum(schema: bytes, rest: bytes) -> str:
-    state = hashlib.sha256(schema + b"\n")
-    state.update(rest)
-    return state.hexdigest()
+    return hashlib.sha256(schema + b"\n" + rest).hexdigest()
 
 
-def _parsed(text: bytes, path: Path, remedy: str) -> Any:
+def _parsed(text: bytes, path: Path, schema: str, key: str, remedy: str) -> dict[str, Any]:
     try:
-        return json.loads(
-            text.decode("utf-8"), parse_float=_finite, parse_constant=_finite, object_pairs_hook=_without_repeats
-        )
+        found = json.loads(text, parse_constant=_no_number)
     except (ValueError, RecursionError):
         _refuse(path, "holds no JSON of finite numbers", remedy)
-
-
-def _finite(text: str) -> float:
-    number = float(text)
-    if not math.isfinite(number):
-        raise ValueError(text)
-    return number
-
-
-def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise ValueError("a key twice")
+    if not isinstance(found, dict) or set(found) != {"of", key} or not isinstance(found["of"], dict):
+        _refuse(path, f"is no {schema} inside", remedy)
     return found
+
+
+def _no_number(text: str) -> NoReturn:
+    raise ValueError(text)
 
 
 def _free_or_regular(path: Path) -> None:

@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
-from avtorch.io.opening import place, read_regular
-from avtorch.io.size import MOST_BYTES, MOST_CELLS, MOST_COLUMNS
+from avtorch.io.arrow_cells import cells_of as arrow_cells
+from avtorch.io.formats.apart import parquet_apart
+from avtorch.io.opening import MOST_BYTES, MOST_CELLS, MOST_COLUMNS, beginning, place, read_regular
 from avtorch.io.text.encoding import decoded, unzipped
-from avtorch.io.text.layout import Layout, cells_of, layout_of
-from avtorch.io.text.rows import rows_of
+from avtorch.io.text.layout import Layout, cells_of, layout_of, rows_of
 from avtorch.io.text.time_stamps import is_time, seconds_of
-from avtorch.io.whole_stamps import with_halves, with_whole_stamps
 from avtorch.numeral import numeral
 
+_NEED = "a CSV or Parquet file"
 _LINES_AHEAD = 100  # lines searched for a header that other lines precede
 
 Wanted = Callable[[tuple[str, ...]], Collection[str]]
@@ -194,22 +194,28 @@ def read_table(path: str | os.PathLike[str], *, header: str | None = None, wante
     512 MiB, 10,000 columns, 1,000,000 characters in a row, or 20 million cells in the wanted columns.
     """
     file = Path(path)
-    raw = read_bytes(file)
     wanted = None if wanted is None else with_halves(wanted)
-    if raw[:4] == b"PAR1":
-        from avtorch.io.parquet import read_parquet
-
-        names, cells = read_parquet(raw, place(file), wanted)
-        return Table(place(file), *with_whole_stamps(names, cells), form="Parquet")
+    if beginning(file, 4, need=_NEED) == b"PAR1":
+        return _parquet(file, wanted)
+    raw = read_bytes(file)
     if file.suffix.lower() in (".parquet", ".pq"):
         raise InputError(f"{place(file)}: named as Parquet but its content is not; write it anew, or name it .csv")
     text, remarks = decoded(place(file), raw)
     return replace(text_table(place(file), text, header, wanted), remarks=remarks)
 
 
+def _parquet(file: Path, wanted: Wanted | None) -> Table:
+    names, columns = parquet_apart(file, wanted)
+    read = {
+        name: arrow_cells(columns.column(name), f"{place(file)}: column {quoted(name)}")
+        for name in columns.column_names
+    }
+    return Table(place(file), *with_whole_stamps(names, [read.get(name) for name in names]), form="Parquet")
+
+
 def read_bytes(file: Path) -> bytes:
     """The content of a file, unzipped; InputError where there is none."""
-    raw = unzipped(place(file), read_regular(file, most=MOST_BYTES, need="a CSV or Parquet file"))
+    raw = unzipped(place(file), read_regular(file, most=MOST_BYTES, need=_NEED))
     if not raw.strip():
         raise InputError(f"{place(file)}: is empty; a header line and rows are needed")
     return raw
@@ -275,3 +281,52 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+_NANOSECONDS = re.compile(r"(?P<stem>.*?)(?:nanosecs?|nsecs?|ns)")
+_SECONDS = ("sec", "secs", "s")
+_AND = " + "
+
+
+def whole_stamps(names: Collection[str]) -> dict[str, tuple[str, str]]:
+    """Columns of seconds and of nanoseconds by the name of their sum, `stamp.sec + stamp.nanosec`."""
+    found = {}
+    for name in names:
+        match = _NANOSECONDS.fullmatch(name)
+        for seconds in (match["stem"] + form for form in _SECONDS) if match else ():
+            if seconds in names:
+                found[f"{seconds}{_AND}{name}"] = seconds, name
+    return found
+
+
+def with_halves(wanted: Callable[[tuple[str, ...]], Collection[str]]) -> Callable[[tuple[str, ...]], Collection[str]]:
+    """What is wanted of a file's columns, with both columns of a stamp that is."""
+
+    def chosen(names: tuple[str, ...]) -> set[str]:
+        named = set(wanted(names))
+        return named | {half for whole, halves in whole_stamps(names).items() if whole in named for half in halves}
+
+    return chosen
+
+
+def with_whole_stamps(
+    names: Sequence[str], cells: Sequence[Sequence[Any] | NDArray | None]
+) -> tuple[tuple[str, ...], tuple[Sequence[Any] | NDArray | None, ...]]:
+    """The `names` and `cells` of a table's columns, with a column of text for each stamp in two: the digits side by
+    side, None where its columns were not read."""
+    whole = list(cells)
+    found = whole_stamps(names)
+    for halves in found.values():
+        seconds, nanoseconds = (cells[names.index(half)] for half in halves)
+        if seconds is None or nanoseconds is None:
+            whole.append(None)
+        else:
+            whole.append([_stamp(str(a).strip(), str(b).strip()) for a, b in zip(seconds, nanoseconds, strict=True)])
+    return (*names, *found), tuple(whole)
+
+
+def _stamp(seconds: str, nanoseconds: str) -> str:
+    whole, parts = seconds.removesuffix(".0"), nanoseconds.removesuffix(".0")
+    if whole.isdecimal() and parts.isdecimal() and len(parts) <= 9:
+        return f"{whole}.{parts:0>9}"
+    return f"{seconds}{_AND}{nanoseconds}"

@@ -17,11 +17,11 @@ from itertools import product
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.io.bad_rows import codes
 from avtorch.io.consistency import MIN_SPANS, SPANS_S
+from avtorch.io.validity import codes
 from avtorch.logcheck.candidates import Column, ranked
 from avtorch.logcheck.header import bare_unit
-from avtorch.logcheck.order_of_events import lateness
+from avtorch.logcheck.recorder import lateness
 from avtorch.logcheck.vocabulary import means_otherwise
 
 MOTION: tuple[str, ...] = ("accel_cmd", "accel", "speed")

@@ -8,13 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.io.bad_rows import MOST_BAD
 from avtorch.io.formats.presets import PRESETS, Preset, Source
-from avtorch.io.merge import held
-from avtorch.io.merged import merged
+from avtorch.io.merge import held, merged
 from avtorch.io.recording import Recording
-from avtorch.io.tables import Table
-from avtorch.io.whole_stamps import whole_stamps
+from avtorch.io.tables import Table, whole_stamps
+from avtorch.io.validity import MOST_BAD
 from avtorch.logcheck.header import Header, header_of
 from avtorch.logcheck.vocabulary import likeness, signals_named
 

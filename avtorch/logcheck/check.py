@@ -20,9 +20,8 @@ from avtorch.io.quality import check as check_quality
 from avtorch.io.source import LogSource, as_log
 from avtorch.io.tables import read_table
 from avtorch.logcheck.candidates import table_of
-from avtorch.logcheck.duration import duration_note
 from avtorch.logcheck.proposal import Proposal, propose
-from avtorch.logcheck.recorder import excitation_notes, recorder_notes
+from avtorch.logcheck.recorder import duration_note, excitation_notes, recorder_notes
 
 
 @dataclass(frozen=True, repr=False)

@@ -17,8 +17,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from avtorch.arrays import BoolArray, FloatArray
+from avtorch.io.clock import stretches
 from avtorch.io.log import Log
-from avtorch.io.segments import stretches
 
 DELAY_S = 0.6
 """Delays that are tried, either way [s]."""

@@ -10,16 +10,16 @@ import numpy as np
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import printable
-from avtorch.io.bad_rows import MOST_BAD
+from avtorch.io.clock import gap_limit, stretches
 from avtorch.io.mapping import Pairs, SignalMap, given_mapping
-from avtorch.io.segments import gap_limit, stretches
 from avtorch.io.tables import Table
+from avtorch.io.validity import MOST_BAD
 from avtorch.logcheck.assignment import MOTION, assign, filled, is_state
 from avtorch.logcheck.candidates import Column, columns_of, ranked
 from avtorch.logcheck.commands import COMMANDS, commands_of, unit_of_command
 from avtorch.logcheck.header import bare_unit, header_of
 from avtorch.logcheck.joint_units import UnitTest, factor, units_together
-from avtorch.logcheck.order_of_events import lateness
+from avtorch.logcheck.recorder import lateness
 from avtorch.logcheck.vocabulary import likeness, signals_named
 
 _TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}

@@ -1,14 +1,21 @@
-"""What a recorder did to the signals, and what the drive excites: facts a reader of the log wants in sentences."""
+"""What a recorder did to the signals, and what the drive excites: facts a reader of the log wants in sentences.
+
+How long `avtorch estimate` and `avtorch diagnose` take is for one core of a server of 2026, by the rows that count.
+`estimate` without measured jerk took 2.2 s for 6,000 rows of one channel, 3.1 s of two channels and 12.7 s for 15,000
+uneven rows, and 2.5 s to start and draw. `diagnose` took 6 to 61 s for logs of 30,000 rows: the more effects act, the
+longer.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.io.clock import stretches
 from avtorch.io.log import Log
-from avtorch.io.segments import stretches
 from avtorch.logcheck.late_channel import late_channel
-from avtorch.logcheck.order_of_events import WITHIN_S, lateness
 
 _CHANNELS = ("accel_cmd", "accel", "speed")
 _UNITS = {"accel_cmd": "m/s²", "accel": "m/s²", "speed": "m/s"}
@@ -126,3 +133,67 @@ def _trembling(values: FloatArray, rate_hz: float) -> float:
         return 0.0
     smooth = np.convolve(values, np.ones(width) / width, mode="same")
     return float(np.std((values - smooth)[width:-width]))
+
+
+_START_S = 2.5
+_ESTIMATE_S = {1: 0.36e-3, 2: 0.52e-3}  # a row, by channels
+_UNEVEN = 1.7  # times as long for rows that are not even
+_JITTER = 0.02  # of a step, from which they are not
+_DIAGNOSE_S = (0.1e-3, 2.0e-3)  # a row, at least and at most
+
+
+def duration_note(log: Log, jitter: float) -> str:
+    """A sentence; `jitter` is the share of a step by which rows are uneven."""
+    rows = int(log.usable.sum())
+    channels = sum(signal is not None for signal in (log.accel, log.speed))
+    each = _ESTIMATE_S[min(max(channels, 1), 2)] * (_UNEVEN if jitter > _JITTER else 1.0)
+    least, most = (_START_S + rows * x for x in _DIAGNOSE_S)
+    return (
+        f"avtorch estimate takes about {_START_S + rows * each:.0f} s of one core, "
+        f"avtorch diagnose {least:.0f} to {most:.0f} s"
+    )
+
+
+WITHIN_S = 1.5
+"""Lateness that is looked for."""
+_LEAST = 50  # rows
+
+
+class Lateness(NamedTuple):
+    """`seconds` by which the second signal follows the first where they `correlate` best; `lead` over the correlation
+    at the opposite lateness."""
+
+    seconds: float
+    correlation: float
+    lead: float
+
+
+def lateness(time: FloatArray, parts: list[slice], first: FloatArray, second: FloatArray) -> Lateness | None:
+    """How much later `second` (row,) is than `first` (row,); None where neither moves or the rows are too few."""
+    part = max(parts, key=lambda s: s.stop - s.start, default=slice(0, 0))
+    t = time[part]
+    if len(t) < _LEAST:
+        return None
+    step = float(np.median(np.diff(t)))
+    grid = np.arange(t[0], t[-1], step)
+    x, y = (np.interp(grid, t, signal[part]) for signal in (first, second))
+    most = min(round(WITHIN_S / step), len(grid) // 4)
+    if most < 2 or x.std() == 0 or y.std() == 0:
+        return None
+    lags = np.arange(-most, most + 1)
+    middle = slice(most, len(grid) - most)
+    here = x[middle] - x[middle].mean()
+    found = np.array([_correlation(here, y[most + lag : len(grid) - most + lag]) for lag in lags])
+    best = int(np.argmax(found))
+    peak = float(lags[best])
+    if 0 < best < len(lags) - 1:
+        left, top, right = found[best - 1 : best + 2]
+        bend = left - 2 * top + right
+        peak += 0.0 if bend == 0 else float(0.5 * (left - right) / bend)
+    return Lateness(peak * step, float(found[best]), float(found[best] - found[len(lags) - 1 - best]))
+
+
+def _correlation(x: FloatArray, y: FloatArray) -> float:
+    y = y - y.mean()
+    size = float(np.sqrt((x @ x) * (y @ y)))
+    return float(x @ y) / size if size > 0 else 0.0

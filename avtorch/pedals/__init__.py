@@ -13,10 +13,9 @@ Example:
     True
 """
 
-from avtorch.pedals.crossed import crossed
 from avtorch.pedals.export import MapTable, accel_table, brake_table, read_map, write_map
 from avtorch.pedals.fit_map import PedalFit, fit_pedals
-from avtorch.pedals.held_out import HeldOut, held_out
+from avtorch.pedals.held_out import HeldOut, crossed, held_out
 from avtorch.pedals.pedal_map import PedalMap, PedalTable
 
 __all__ = [

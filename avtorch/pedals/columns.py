@@ -14,8 +14,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.pedals.pedal_drive import PedalDrive, Piece
-from avtorch.pedals.pedal_map import SIGN, PedalMap, PedalTable, place
-from avtorch.pedals.speed_loop import RATE
+from avtorch.pedals.pedal_map import RATE, SIGN, PedalMap, PedalTable, place
 
 _SECONDS_A_KNOT = 12.0
 _PEDAL_KNOTS, _SPEED_KNOTS, _LOOP_KNOTS = (3, 8), (2, 7), (2, 4)

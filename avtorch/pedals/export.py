@@ -22,8 +22,7 @@ from avtorch.errors import InputError
 from avtorch.io import atomic
 from avtorch.io.opening import place
 from avtorch.io.tables import Table, read_table
-from avtorch.pedals.pedal_map import PedalMap, PedalTable, unit_of
-from avtorch.pedals.speed_loop import ERROR, RATE
+from avtorch.pedals.pedal_map import ERROR, RATE, PedalMap, PedalTable, unit_of
 
 MAP_FILE, ACCEL_FILE, BRAKE_FILE = "pedal_map.csv", "accel_map.csv", "brake_map.csv"
 _LAST_DIGIT = 0.001  # of an acceleration in a table, m/s²

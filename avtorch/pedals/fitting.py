@@ -13,10 +13,15 @@ import numpy as np
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.pedals.columns import MapColumns
-from avtorch.pedals.lag_search import DEAD_TIMES_S, LAGS_S, lag_of
-from avtorch.pedals.lagged import speed_gained
-from avtorch.pedals.least_squares import bounded_solution
-from avtorch.pedals.normal_equations import normal_equations, rows_of
+from avtorch.pedals.lagged import (
+    DEAD_TIMES_S,
+    LAGS_S,
+    bounded_solution,
+    lag_of,
+    normal_equations,
+    rows_of,
+    speed_gained,
+)
 from avtorch.pedals.pedal_drive import PedalDrive, Piece
 from avtorch.pedals.pedal_map import PedalMap
 

@@ -11,7 +11,7 @@ from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.io import Log, LogSource, as_logs
 from avtorch.io.mapping import PEDALS
-from avtorch.pedals.speed_loop import ERROR, RATE, inputs_of, jumps
+from avtorch.pedals.pedal_map import ERROR, RATE, inputs_of, jumps
 
 CELL_S = 0.05
 BLOCK_S, SHORT_BLOCK_S = 10.0, 5.0

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from avtorch.errors import printable
 from avtorch.io import Log, check, read_following, read_leader
-from avtorch.io.raw_leader import RawLeader
+from avtorch.io.leaders import RawLeader
 
 from .mutations import AWKWARD, fuzzed, mutated, outcome
 

@@ -11,8 +11,7 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.io import Log, check, read_leader
-from avtorch.io.ngsim import JOIN_SPEED_MPS, join_events, read_event
-from avtorch.io.openacc import astazero, zalazone
+from avtorch.io.leaders import JOIN_SPEED_MPS, astazero, join_events, read_event, zalazone
 from avtorch.io.tables import read_table
 from avtorch.io.us06 import US06_SPEED_MPS
 

@@ -74,8 +74,6 @@ def forged(body: bytes, schema: str = SCHEMA) -> bytes:
         b'"of": [], "content": 1}',
         b'"of": {}, "content": NaN}',
         b'"of": {}, "content": -Infinity}',
-        b'"of": {}, "content": 1e999}',
-        b'"of": {}, "content": 1, "content": 2}',
         b'"of": {}, "content": ' + b"9" * 100_000 + b"}",
         b'"of": {}, "content": ' + b"[" * 100_000 + b"]" * 100_000 + b"}",
         b'"of": {}, "content": "\xff"}',

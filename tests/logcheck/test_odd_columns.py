@@ -9,7 +9,7 @@ import pytest
 
 import avtorch
 from avtorch.io import Log
-from avtorch.io.bad_rows import codes
+from avtorch.io.validity import codes
 
 from .drives import Columns, drive
 

@@ -14,10 +14,9 @@ from avtorch.pedals import PedalMap, PedalTable, fit_pedals, held_out, read_map,
 from avtorch.pedals.columns import MapColumns
 from avtorch.pedals.fitting import Fitting
 from avtorch.pedals.held_out import map_demand, roll_out
-from avtorch.pedals.loop_rollout import roll
+from avtorch.pedals.loop_fitting import roll
 from avtorch.pedals.pedal_drive import PedalDrive
-from avtorch.pedals.pedal_map import SIGN
-from avtorch.pedals.speed_loop import ERROR, RATE, rate_of
+from avtorch.pedals.pedal_map import ERROR, RATE, SIGN, rate_of
 from tests.pedals.speed_cars import BRAKE, DELAY_S, DT, FORWARD, GAIN, LAG_S, PUSH, demanded, drive
 
 # what the car's difference equation is in continuous time: its lag forgets as this one does, and it acts a step later

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 from avtorch.errors import InputError
 from avtorch.io.formats.apart import open_apart
+from avtorch.io.formats.kinds import NEED, is_kind, kind_at
 from avtorch.io.formats.library import refuse_missing
-from avtorch.io.formats.recognise import NEED, is_kind, kind_at
 from avtorch.io.opening import place
 from avtorch.io.recording import Recording
 
@@ -37,6 +37,8 @@ def open_recording(path: str | os.PathLike[str], *, dbc: Sequence[str | os.PathL
         raise InputError(f"{place(path)}: is {what}; {NEED} is needed")
     if dbc is not None and kind.reader != "can":
         raise InputError(f"{place(path)}: is {kind.words}, which no DBC decodes; dbc is for CAN logs")
+    if isinstance(dbc, (str, os.PathLike)):
+        raise InputError(f"dbc: found {place(dbc)}; a list of paths is needed")
     refuse_missing(place(path), kind)
     return open_apart(path, kind, dbc)
 

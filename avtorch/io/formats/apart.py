@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.io.formats.kinds import Kind
+from avtorch.io.formats.kinds import PARQUET, Kind
 from avtorch.io.formats.listed import Listed
 from avtorch.io.opening import place
 from avtorch.io.recording import Channel
@@ -32,52 +32,57 @@ MOST_SECONDS, SECONDS_PER_MIB = 60.0, 1.0
 """For opening, and for each reading, by the size of the file: a workbook of 20 million cells takes a third of that."""
 
 
-class ApartRecording(Listed):
-    """A recording that another process holds open."""
-
-    def __init__(self, child: _Child, listing: dict[str, Any]) -> None:
-        super().__init__(child.source, listing["form"], listing["names"], listing["units"], listing["remarks"])
-        self._child = child
-        weakref.finalize(self, child.end)
-
-    def _read(self, names: tuple[str, ...]) -> dict[str, Channel]:
-        answer = self._child.ask(names)
-        clocks = [self._child.numbers(count) for count in answer["clocks"]]
-        return {name: Channel(name, clocks[k], self._child.numbers(len(clocks[k]))) for name, k in answer["channels"]}
-
-
-def open_apart(
-    path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None = None
-) -> ApartRecording:
+def open_apart(path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None = None) -> Listed:
     """Open a recording in a process of its own; `dbc`: the databases of a CAN log. Raises InputError, also where that
     process ends or takes too long."""
-    child = _Child(path, kind, dbc)
+    child = Child(path, kind, dbc)
+
+    def load(names: tuple[str, ...]) -> dict[str, Channel]:
+        answer = child.ask(names)
+        clocks = [child.numbers(count) for count in answer["clocks"]]
+        return {name: Channel(name, clocks[k], child.numbers(len(clocks[k]))) for name, k in answer["channels"]}
+
+    listing = child.listing
+    found = Listed(child.source, listing["form"], listing["names"], listing["units"], listing["remarks"], load)
+    weakref.finalize(found, child.end)
+    return found
+
+
+def parquet_apart(
+    path: str | os.PathLike[str], wanted: Callable[[tuple[str, ...]], Collection[str]] | None
+) -> tuple[tuple[str, ...], Any]:
+    """The names of all columns of a Parquet file, and the `wanted` ones (default: all) as an Arrow table.
+
+    Raises InputError, also where the process that reads it ends or takes too long.
+    """
+    import pyarrow as pa
+
+    child = Child(path, PARQUET, None)
     try:
-        return ApartRecording(child, child.answer())
-    except BaseException:
+        names = tuple(child.listing["names"])
+        answer = child.ask(tuple(names if wanted is None else wanted(names)))
+        return names, pa.ipc.open_stream(child.content(answer["bytes"])).read_all()
+    finally:
         child.end()
-        raise
 
 
-class _Child:
-    """The other process: requests are lines of JSON, answers are a line of JSON and the numbers it tells of."""
+class Child:
+    """The other process: requests are lines of JSON, answers are a line of JSON and the numbers it tells of. `listing`
+    is its first answer."""
 
     def __init__(self, path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None) -> None:
         self.source, self._words = place(path), kind.words
         self._seconds = MOST_SECONDS + SECONDS_PER_MIB * _size(path) / 2**20
+        self._late = False
         # -P: nothing of the folder that the user happens to work in
         command = [sys.executable or "python", "-P", "-W", "ignore", "-m", "avtorch.io.formats.apart_process"]
         # a trace of a panic, which nobody sees, takes most of a second
         environment = dict(os.environ, RUST_BACKTRACE="0")
         environment["PYTHONPATH"] = os.pathsep.join(part for part in sys.path if part)
+        databases = [] if dbc is None else ["--dbc", *(os.fspath(base) for base in dbc)]
         try:
             self._process = subprocess.Popen(
-                [
-                    *command,
-                    kind.words,
-                    os.fspath(path),
-                    *([] if dbc is None else ["--dbc", *(os.fspath(base) for base in dbc)]),
-                ],
+                [*command, kind.words, os.fspath(path), *databases],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -85,31 +90,48 @@ class _Child:
             )
         except (OSError, ValueError) as fault:
             raise InputError(f"{self.source}: no process can be started to read it ({fault})") from None
-        self._late = False
+        try:
+            self.listing = self._answer()
+        except BaseException:
+            self.end()
+            raise
 
-    def ask(self, names: tuple[str, ...]) -> dict[str, Any]:
-        """The answer to a request for channels."""
+    def ask(self, names: Sequence[str]) -> dict[str, Any]:
+        """The answer to a request for channels or columns."""
         assert self._process.stdin is not None
         with suppress(OSError):  # where it has ended, the answer tells how
             self._process.stdin.write(json.dumps(names).encode() + b"\n")
             self._process.stdin.flush()
-        return self.answer()
+        return self._answer()
 
-    def answer(self) -> dict[str, Any]:
-        line = self._within(lambda stream: stream.readline())
+    def content(self, size: int) -> bytes:
+        """So many bytes behind an answer."""
+        raw = self._within(lambda stream: stream.read(size))
+        if len(raw) != size:
+            raise self._ended()
+        return raw
+
+    def numbers(self, count: int) -> FloatArray:
+        """So many numbers behind an answer."""
+        return np.frombuffer(self.content(8 * count), dtype=np.float64).copy()
+
+    def end(self) -> None:
+        """End the process, and leave nothing of it."""
+        self._process.kill()
+        self._process.wait()
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                with suppress(OSError):  # a request that nobody will read
+                    stream.close()
+
+    def _answer(self) -> dict[str, Any]:
         try:
-            answer = json.loads(line)
+            answer = json.loads(self._within(lambda stream: stream.readline()))
         except ValueError:
             raise self._ended() from None
         if "error" in answer:
             raise InputError(answer["error"])
         return answer
-
-    def numbers(self, count: int) -> FloatArray:
-        raw = self._within(lambda stream: stream.read(8 * count))
-        if len(raw) != 8 * count:
-            raise self._ended()
-        return np.frombuffer(raw, dtype=np.float64).copy()
 
     def _within(self, read: Any) -> bytes:
         """What `read` takes of the answer; the process is ended when it is late."""
@@ -140,15 +162,6 @@ class _Child:
             f"{self.source}: is damaged, or takes more memory than it may: it ended the process that read it ({how}); "
             f"an undamaged {self._words} file is needed"
         )
-
-    def end(self) -> None:
-        """End the process, and leave nothing of it."""
-        self._process.kill()
-        self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout):
-            if stream is not None:
-                with suppress(OSError):  # a request that nobody will read
-                    stream.close()
 
 
 def _size(path: str | os.PathLike[str]) -> int:

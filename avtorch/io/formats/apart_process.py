@@ -1,7 +1,8 @@
 """The process in which a reader runs apart: opens one recording, then answers requests for its channels.
 
 Arguments are the name of the format, the path, and the databases of a CAN log. Each request is a line of JSON, the
-names; each answer is a line of JSON, then the numbers: the clocks, then the values of the channels.
+names; each answer is a line of JSON, then the numbers: the clocks, then the values of the channels, or the columns of a
+Parquet file as an Arrow stream.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import importlib
 import json
 import sys
 from collections.abc import Iterable
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from avtorch.child_process import answer, answers_to, limit_memory
 from avtorch.errors import InputError
@@ -29,40 +30,42 @@ def main() -> None:
     try:
         reader = importlib.import_module(f"avtorch.io.formats.{kind.reader}")
         given = {"dbc": sys.argv[4:]} if sys.argv[3:4] == ["--dbc"] else {}
-        recording: Recording = reader.open_file(sys.argv[2], kind, **given)
+        opened: Any = reader.open_file(sys.argv[2], kind, **given)
     except InputError as fault:
         answer(out, {"error": str(fault)})
         return
-    answer(
-        out,
-        {
-            "form": recording.form,
-            "names": recording.names,
-            "units": dict(recording.units),
-            "remarks": recording.remarks,
-        },
-    )
-    serve(recording, sys.stdin.buffer, out)
+    if kind is kinds.PARQUET:
+        answer(out, {"names": opened.names})
+    else:
+        told = {"form": opened.form, "names": opened.names, "units": dict(opened.units), "remarks": opened.remarks}
+        answer(out, told)
+    serve(opened, sys.stdin.buffer, out)
 
 
-def serve(recording: Recording, requests: Iterable[bytes], out: BinaryIO) -> None:
+def serve(opened: Any, requests: Iterable[bytes], out: BinaryIO) -> None:
     """Answer each of the requests."""
     for line in requests:
         try:
-            channels = list(recording.read(json.loads(line)).values())
+            if hasattr(opened, "stream"):
+                raw = opened.stream(json.loads(line))
+                answer(out, {"bytes": len(raw)})
+                out.write(raw)
+                out.flush()
+            else:
+                _channels(opened, json.loads(line), out)
         except InputError as fault:
             answer(out, {"error": str(fault)})
-            continue
-        clocks = {id(channel.time): channel.time for channel in channels}
-        place = {key: k for k, key in enumerate(clocks)}
-        answer(
-            out,
-            {
-                "clocks": [len(clock) for clock in clocks.values()],
-                "channels": [(channel.name, place[id(channel.time)]) for channel in channels],
-            },
-            [*clocks.values(), *(channel.values for channel in channels)],
-        )
+
+
+def _channels(recording: Recording, names: list[str], out: BinaryIO) -> None:
+    channels = list(recording.read(names).values())
+    clocks = {id(channel.time): channel.time for channel in channels}
+    place = {key: k for k, key in enumerate(clocks)}
+    told = {
+        "clocks": [len(clock) for clock in clocks.values()],
+        "channels": [(channel.name, place[id(channel.time)]) for channel in channels],
+    }
+    answer(out, told, [*clocks.values(), *(channel.values for channel in channels)])
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
@@ -12,92 +11,106 @@ from typing import Any
 
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.formats import kinds
-from avtorch.io.formats.bag_fields import numeric_fields, stamp_field
-from avtorch.io.formats.bag_opening import open_bag
 from avtorch.io.formats.bag_types import LAYOUTS
 from avtorch.io.formats.kinds import Kind
 from avtorch.io.formats.library import guarded, library
-from avtorch.io.formats.listed import refuse_cells
-from avtorch.io.formats.topics import Piece, TopicRecording
+from avtorch.io.formats.listed import Listed, Piece, topic_recording
 from avtorch.io.opening import place
-from avtorch.io.size import MOST_CELLS, MOST_COLUMNS
 
 _NEED = "an undamaged ROS bag with its index (`rosbag reindex` or `mcap recover` mends one that was cut off)"
 _NANO = 10**9
+_TIME, _DURATION = "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"
+_NUMBERS = frozenset(
+    (
+        "bool", "byte", "char", "octet", "float32", "float64",
+        "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64",
+    )
+)  # fmt: skip
+_DEEPEST = 8
+_MOST = 2000  # fields of one type: types within types may multiply
+_BASE, _NAME = 1, 2  # kinds of a field: a number or text, another type; the rest are arrays
 
 
 @dataclass(frozen=True)
-class Topic:
+class _Topic:
     """One topic: its connections, its type, and the stores that know the type, the likeliest first."""
 
     connections: tuple[Any, ...]
     type: str
     stores: tuple[Any, ...]
     stamp: str | None
-
-    @property
-    def count(self) -> int:
-        """Messages as the bag's index says, where it says a number; a folder's metadata may be damaged."""
-        told = (connection.msgcount for connection in self.connections)
-        return sum(max(0, n) for n in told if isinstance(n, int))
+    fields: tuple[str, ...]
 
 
-class BagRecording(TopicRecording):
-    """A bag. Channels are ``/topic/field/sub``, every numeric field but arrays; their time is the stamp of the
-    message's header or its own [s since 1970], and the time of recording where it has none or where it is not set."""
+def open_file(path: str | os.PathLike[str], kind: Kind) -> Listed:
+    """Open a bag and list its fields from the definitions of its types, without reading a message.
 
-    _topics: Mapping[str, Topic]
+    Channels are ``/topic/field/sub``, every numeric field but arrays; their time is the stamp of the message's header
+    or its own [s since 1970], and the time of recording where it has none or where it is not set. Types that the bag
+    does not define are those of ROS 2 itself, of Autoware, and of Ackermann drives. Raises InputError.
+    """
+    source = place(path)
+    typesys = library("rosbags.typesys", source, kind)
+    with guarded(source, _NEED):
+        reader = _opened(Path(path), kind, source)
+        topics, left = _topics(reader.connections, _Known(typesys))
+    fields: dict[str, tuple[str, str]] = {}
+    for name, topic in topics.items():
+        for field in topic.fields:
+            fields.setdefault(f"{name}/{field.replace('.', '/')}", (name, field))
+    if not fields and left:
+        types = listed(sorted({printable(c.msgtype) for c in reader.connections}))
+        raise InputError(f"{source}: no message type is known: {types}; definitions in the bag are needed")
 
-    def __init__(
-        self,
-        source: str,
-        kind: Kind,
-        reader: Any,
-        topics: Mapping[str, Topic],
-        fields: Mapping[str, tuple[str, str]],
-        remarks: Sequence[str],
-    ) -> None:
-        super().__init__(source, kind.words, topics, fields, remarks)
-        self._reader = reader
-        self._one = kind is kinds.ROS1
+    def decoded(store: Any, raw: bytes, type_: str) -> Any:
+        return store.deserialize_ros1(raw, type_) if kind is kinds.ROS1 else store.deserialize_cdr(raw, type_)
 
-    def _collect(self, paths: Mapping[str, Sequence[str]]) -> dict[str, Piece]:
-        pieces = {name: Piece(len(own)) for name, own in paths.items()}
-        takers = {name: _taker(self._topics[name], own, pieces[name]) for name, own in paths.items()}
-        stores: dict[str, Any] = {}  # of the types, found by a topic's first message
-        by_connection = {(c.topic, c.id): name for name in paths for c in self._topics[name].connections}
-        name, samples = "", 0
-
-        def where() -> str:
-            at = f": topic {quoted(name, 80)}: message {len(pieces[name].logged) + 1}" if name else ""
-            return f"{self.source}{at}"
-
-        with guarded(where, _NEED):
-            connections = [c for name in paths for c in self._topics[name].connections]
-            for connection, at, raw in self._reader.messages(connections):
-                name = by_connection[connection.topic, connection.id]
-                if name not in stores:
-                    stores[name] = self._fitting(self._topics[name], raw)
-                takers[name](self._decoded(stores[name], raw, self._topics[name].type), at)
-                samples += len(paths[name])
-                if samples > MOST_CELLS:
-                    refuse_cells(self.source, samples)
-        return pieces
-
-    def _fitting(self, topic: Topic, raw: bytes) -> Any:
+    def fitting(topic: _Topic, raw: bytes) -> Any:
+        """The store whose layout of the type a message has."""
         for store in topic.stores[:-1]:
             try:
-                self._decoded(store, raw, topic.type)
+                decoded(store, raw, topic.type)
             except Exception:  # whatever a wrong layout runs into
                 continue
             return store
         return topic.stores[-1]
 
-    def _decoded(self, store: Any, raw: bytes, type_: str) -> Any:
-        return store.deserialize_ros1(raw, type_) if self._one else store.deserialize_cdr(raw, type_)
+    def collect(paths: Mapping[str, Sequence[str]], pieces: Mapping[str, Piece]) -> None:
+        takers = {name: _taker(topics[name], own, pieces[name]) for name, own in paths.items()}
+        stores: dict[str, Any] = {}  # of the types, found by a topic's first message
+        by_connection = {(c.topic, c.id): name for name in paths for c in topics[name].connections}
+        name = ""
+
+        def where() -> str:
+            at = f": topic {quoted(name, 80)}: message {len(pieces[name].logged) + 1}" if name else ""
+            return f"{source}{at}"
+
+        with guarded(where, _NEED):
+            connections = [c for name in paths for c in topics[name].connections]
+            for connection, at, raw in reader.messages(connections):
+                name = by_connection[connection.topic, connection.id]
+                if name not in stores:
+                    stores[name] = fitting(topics[name], raw)
+                takers[name](decoded(stores[name], raw, topics[name].type), at)
+
+    remarks = [f"topics left out, their type is unknown or differs: {listed(left)}"] if left else []
+    return topic_recording(source, kind.words, fields, remarks, collect)
 
 
-def _taker(topic: Topic, paths: Sequence[str], piece: Piece) -> Callable[[Any, int], None]:
+def _opened(file: Path, kind: Kind, source: str) -> Any:
+    """An opened reader of rosbags, with `connections` and `messages`."""
+    if kind is kinds.ROS1:
+        reader = library("rosbags.rosbag1", source, kind).Reader(file)
+    else:
+        storage = {kinds.ROS2_FOLDER: "dir", kinds.ROS2_SQLITE: ".db3", kinds.ROS2_MCAP: ".mcap"}[kind]
+        if kind is kinds.ROS2_SQLITE and any(mark in str(file) for mark in "?#%"):  # rosbags makes an address of it
+            raise InputError(f"{source}: has one of ? # % in its path; a path without is needed for SQLite")
+        reader = library("rosbags.rosbag2", source, kind).Reader.STORAGE_PLUGINS[storage](file)
+    reader.open()
+    return reader
+
+
+def _taker(topic: _Topic, paths: Sequence[str], piece: Piece) -> Callable[[Any, int], None]:
     """Puts a message that was recorded at a time [ns] into the piece."""
     fields = attrgetter(paths[0], *paths)  # a tuple for one field, too
     stamp = attrgetter(topic.stamp) if topic.stamp else None
@@ -108,41 +121,6 @@ def _taker(topic: Topic, paths: Sequence[str], piece: Piece) -> Callable[[Any, i
         piece.take(fields(message)[1:], at / _NANO, stamped)
 
     return take
-
-
-def open_file(path: str | os.PathLike[str], kind: Kind) -> BagRecording:
-    """Open a bag and list its fields from the definitions of its types, without reading a message.
-
-    Types that the bag does not define are those of ROS 2 itself, of Autoware, and of Ackermann drives. Raises
-    InputError.
-    """
-    source = place(path)
-    typesys = library("rosbags.typesys", source, kind)
-    with guarded(source, _NEED):
-        reader = open_bag(Path(path), kind, source)
-    try:
-        with guarded(source, _NEED):
-            known = _Known(typesys)
-            topics, left = _topics(reader.connections, known)
-        fields: dict[str, tuple[str, str]] = {}
-        remarks = [f"topics left out, their type is unknown or differs: {listed(left)}"] if left else []
-        for name, topic in topics.items():
-            with guarded(f"{source}: topic {quoted(name, 80)}", _NEED):
-                for field in numeric_fields(topic.stores[0].fielddefs, topic.type):
-                    fields.setdefault(f"{name}/{field.replace('.', '/')}", (name, field))
-            if len(fields) > MOST_COLUMNS:
-                remarks.append(f"only the first {MOST_COLUMNS:,} fields are listed")
-                fields = dict(list(fields.items())[:MOST_COLUMNS])
-                break
-        if not fields and left:
-            types = listed(sorted({printable(c.msgtype) for c in reader.connections}))
-            raise InputError(f"{source}: no message type is known: {types}; definitions in the bag are needed")
-        recording = BagRecording(source, kind, reader, topics, fields, remarks)
-    except BaseException:
-        reader.close()
-        raise
-    weakref.finalize(recording, reader.close)
-    return recording
 
 
 class _Known:
@@ -189,25 +167,53 @@ class _Known:
         return self._others
 
 
-def _topics(connections: Sequence[Any], known: _Known) -> tuple[dict[str, Topic], list[str]]:
+def _topics(connections: Sequence[Any], known: _Known) -> tuple[dict[str, _Topic], list[str]]:
     """Topics by name, and the names of those whose type is not known or is not one and the same."""
     by_name: dict[str, list[Any]] = {}
     for connection in connections:
         by_name.setdefault(printable(connection.topic), []).append(connection)
-    topics: dict[str, Topic] = {}
+    topics: dict[str, _Topic] = {}
     left = []
     for name, own in by_name.items():
         first = own[0]
-        same = all((c.msgtype, c.msgdef) == (first.msgtype, first.msgdef) for c in own)
         try:
+            if not all((c.msgtype, c.msgdef) == (first.msgtype, first.msgdef) for c in own):
+                raise ValueError("messages of several types")
+            if not all(getattr(c.ext, "serialization_format", "cdr") in ("cdr", "") for c in own):
+                raise ValueError("messages that are not CDR")
             stores = known.stores(first)
-            fits = same and all(getattr(c.ext, "serialization_format", "cdr") in ("cdr", "") for c in own)
-            stamp = stamp_field(stores[0].fielddefs, first.msgtype)
-            numeric_fields(stores[0].fielddefs, first.msgtype)
+            definitions = stores[0].fielddefs
+            stamp, fields = _stamp_field(definitions, first.msgtype), numeric_fields(definitions, first.msgtype)
         except Exception:  # a definition that cannot be parsed leaves out its topic, not the bag
-            fits, stores, stamp = False, (), None
-        if fits:
-            topics[name] = Topic(tuple(own), first.msgtype, stores, stamp)
-        else:
             left.append(name)
+            continue
+        topics[name] = _Topic(tuple(own), first.msgtype, stores, stamp, tuple(fields))
     return topics, left
+
+
+def numeric_fields(definitions: Mapping[str, Any], type_: str, before: Sequence[str] = ()) -> list[str]:
+    """Paths such as ``twist.linear.x`` of the numeric fields, without arrays, stamps and durations; 2000 at most.
+
+    Raises KeyError for a type that is not defined.
+    """
+    found: list[str] = []
+    for name, (kind, what) in definitions[type_][1]:
+        path = (*before, name)
+        if kind == _BASE and what[0] in _NUMBERS:
+            found.append(".".join(path))
+        elif kind == _NAME and what not in (_TIME, _DURATION) and len(path) < _DEEPEST:
+            found += numeric_fields(definitions, what, path)
+        if len(found) >= _MOST:
+            return found[:_MOST]
+    return found
+
+
+def _stamp_field(definitions: Mapping[str, Any], type_: str) -> str | None:
+    """The path of the stamp that dates a message: its header's, or its own; None where it has neither."""
+    fields = dict(definitions[type_][1])
+    if fields.get("stamp") == (_NAME, _TIME):
+        return "stamp"
+    kind, what = fields.get("header", (None, None))
+    if kind == _NAME and dict(definitions[what][1]).get("stamp") == (_NAME, _TIME):
+        return "header.stamp"
+    return None

@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import os
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,89 +14,75 @@ import numpy as np
 
 from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats import kinds
-from avtorch.io.formats.can_database import Decoded, databases_of, messages_of
 from avtorch.io.formats.kinds import Kind
-from avtorch.io.formats.library import guarded, library, reason, silenced
-from avtorch.io.formats.listed import Listed, refuse_cells
-from avtorch.io.opening import place, read_regular
+from avtorch.io.formats.library import guarded, library, reason
+from avtorch.io.formats.listed import Listed
+from avtorch.io.opening import MOST_BYTES, place, read_regular
 from avtorch.io.recording import Channel
-from avtorch.io.size import MOST_BYTES
 
 _NEED = "an undamaged BLF, ASC or candump log"
+_NEED_DBC = "a DBC database"
+_MOST_DBC = 2**24  # bytes of a DBC
 
 Identifier = tuple[int, bool]
-Wanted = dict[Identifier, list[tuple[Decoded, dict[str, tuple[array, array]]]]]
-"""By identifier, each message with the columns of time and values of its signals."""
 
 
-class CanRecording(Listed):
-    """A CAN log with its databases. Channels are ``Message.Signal``, of those messages that the log holds.
+@dataclass(frozen=True)
+class _Message:
+    """One message of a database, with the channels of its signals by the signals' names."""
 
-    Time is that of the log: from its start in ASC, since 1970 in BLF and candump. Values are physical, and those that
-    the database names by texts are their numbers. A signal that its multiplexer leaves out of a frame has no sample
-    there.
+    message: Any
+    channels: dict[str, str]
+
+
+def open_file(path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None = None) -> Listed:
+    """Open a CAN log with its databases; one pass over the log finds which messages it holds.
+
+    Channels are ``Message.Signal``, of those messages that the log holds. Time is that of the log: from its start in
+    ASC, since 1970 in BLF and candump. Values are physical, and those that the database names by texts are their
+    numbers. A signal that its multiplexer leaves out of a frame has no sample there. Raises InputError for a log
+    without a database or of another one, and for a damaged one; a log that is cut off is read as far as it goes, with
+    a remark.
     """
+    source = place(path)
+    messages, units = _messages_of(_databases_of(Path(path), dbc, source), source, kind)
+    frames = _Frames(Path(path), kind, source)
+    present = {key: own for key, own in messages.items() if key in frames.bus}
+    names = [name for own in present.values() for one in own for name in one.channels.values()]
+    if not names:
+        known = listed(f"{number:X}" for number, _ in messages)
+        seen = listed(f"{number:X}" for number, _ in sorted(frames.bus))
+        raise InputError(
+            f"{source}: holds no message of its database; identifiers in the log: {seen}; in the database: {known}"
+        )
 
-    def __init__(
-        self,
-        source: str,
-        kind: Kind,
-        frames: _Frames,
-        messages: Mapping[Identifier, Sequence[Decoded]],
-        units: Mapping[str, str],
-    ) -> None:
-        present = {key: own for key, own in messages.items() if key in frames.bus}
-        names = [name for own in present.values() for decoded in own for name in decoded.channels.values()]
-        if not names:
-            known = listed(f"{number:X}" for number, _ in messages)
-            seen = listed(f"{number:X}" for number, _ in sorted(frames.bus))
-            raise InputError(
-                f"{source}: holds no message of its database; identifiers in the log: {seen}; in the database: {known}"
-            )
-        super().__init__(source, kind.words, names, {n: units[n] for n in names if n in units}, frames.remarks)
-        self._frames, self._messages = frames, present
-
-    def _read(self, names: tuple[str, ...]) -> dict[str, Channel]:
-        asked = frozenset(names)
-        wanted: Wanted = {}
-        for key, own in self._messages.items():
-            for decoded in own:
-                columns = {s: (array("d"), array("d")) for s, n in decoded.channels.items() if n in asked}
-                if columns:
-                    wanted.setdefault(key, []).append((decoded, columns))
-        with silenced():
-            self._decode(wanted)
-        found: dict[str, Channel] = {}
-        for own in wanted.values():
-            for decoded, columns in own:
-                for signal, (time, column) in columns.items():
-                    name = decoded.channels[signal]
-                    found[name] = Channel(name, np.array(time, dtype=np.float64), np.array(column, dtype=np.float64))
-        return {name: found[name] for name in names}
-
-    def _decode(self, wanted: Wanted) -> None:
-        """One pass over the log: samples of the wanted signals go to their columns."""
-        samples = 0
-        for number, key, frame in self._frames.read(frozenset(wanted)):
-            for decoded, columns in wanted[key]:
+    def load(asked: tuple[str, ...]) -> dict[str, Channel]:
+        columns = {name: (array("d"), array("d")) for name in asked}
+        wanted = {
+            key: [one for one in own if not columns.keys().isdisjoint(one.channels.values())]
+            for key, own in present.items()
+        }
+        for number, key, frame in frames.read({key for key, own in wanted.items() if own}):
+            for one in wanted[key]:
                 try:
-                    values = decoded.message.decode(
+                    values = one.message.decode(
                         bytes(frame.data), decode_choices=False, allow_truncated=True, decode_containers=False
                     )
                 except Exception as fault:
-                    name = next(iter(decoded.channels.values()))
+                    name = next(iter(one.channels.values()))
                     raise InputError(
-                        f"{self.source}: channel {quoted(name, 80)}: frame {number} at {frame.timestamp:.6f} s cannot "
+                        f"{source}: channel {quoted(name, 80)}: frame {number} at {frame.timestamp:.6f} s cannot "
                         f"be decoded ({reason(fault)}); the database that belongs to the log is needed"
                     ) from None
-                for signal, (time, column) in columns.items():
-                    if (value := values.get(signal)) is not None:
-                        time.append(frame.timestamp)
-                        column.append(value)
-                        samples += 1
-            if number % 4096 == 0:
-                refuse_cells(self.source, samples)
-        refuse_cells(self.source, samples)
+                for signal, value in values.items():
+                    if value is not None and (column := columns.get(one.channels.get(signal, ""))) is not None:
+                        column[0].append(frame.timestamp)
+                        column[1].append(value)
+        return {
+            name: Channel(name, *(np.array(x, dtype=np.float64) for x in column)) for name, column in columns.items()
+        }
+
+    return Listed(source, kind.words, names, {n: units[n] for n in names if n in units}, frames.remarks, load)
 
 
 class _Frames:
@@ -108,12 +95,11 @@ class _Frames:
         self.bus: dict[Identifier, Any] = {}
         others: set[Identifier] = set()
         frames = 0
-        with silenced():
-            for number, frame in self._all():
-                frames = number
-                key = (frame.arbitration_id, bool(frame.is_extended_id))
-                if self.bus.setdefault(key, frame.channel) != frame.channel:
-                    others.add(key)
+        for number, frame in self._all():
+            frames = number
+            key = (frame.arbitration_id, bool(frame.is_extended_id))
+            if self.bus.setdefault(key, frame.channel) != frame.channel:
+                others.add(key)
         if frames == 0:
             raise InputError(f"{source}: holds no frame; {_NEED} is needed")
         self._most = frames
@@ -121,7 +107,7 @@ class _Frames:
             names = listed(f"{n:X}" for n, _ in sorted(others))
             self.remarks.append(f"identifiers that several buses have are read from the bus of their first: {names}")
 
-    def read(self, wanted: frozenset[Identifier]) -> Iterator[tuple[int, Identifier, Any]]:
+    def read(self, wanted: set[Identifier]) -> Iterator[tuple[int, Identifier, Any]]:
         """Number, identifier and frame, of those that are wanted."""
         for number, frame in self._all():
             key = (frame.arbitration_id, bool(frame.is_extended_id))
@@ -168,14 +154,57 @@ class _Frames:
         return (can.ASCReader if self._kind is kinds.ASC else can.CanutilsLogReader)(text), text
 
 
-def open_file(
-    path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None = None
-) -> CanRecording:
-    """Open a CAN log with its databases; one pass over the log finds which messages it holds.
+def _databases_of(log: Path, named: Sequence[str | os.PathLike[str]] | None, source: str) -> list[Path]:
+    """The databases that decode `log`: those `named`; else the one beside it of its name; else the folder's only one.
 
-    Raises InputError for a log without a database or of another one, and for a damaged one; a log that is cut off is
-    read as far as it goes, with a remark.
+    Raises InputError where there is none, or more than one and none of the log's name.
     """
-    source = place(path)
-    messages, units = messages_of(databases_of(Path(path), dbc, source), source, kind)
-    return CanRecording(source, kind, _Frames(Path(path), kind, source), messages, units)
+    if named is not None:
+        if not named:
+            raise InputError(f"{source}: dbc names no database; one is needed")
+        return [Path(path) for path in named]
+    found = sorted(path for path in log.parent.iterdir() if path.suffix.lower() == ".dbc" and path.is_file())
+    own = [path for path in found if path.stem == log.stem]
+    if own:
+        return own[:1]
+    if len(found) == 1:
+        return found
+    what = f"its folder holds {len(found)}: {listed(path.name for path in found)}" if found else "found none beside it"
+    raise InputError(
+        f"{source}: is a CAN log, which a DBC database decodes; {what}; "
+        f"name one by dbc, or {log.stem}.dbc beside the log"
+    )
+
+
+def _messages_of(
+    databases: Sequence[Path], source: str, kind: Kind
+) -> tuple[dict[Identifier, list[_Message]], dict[str, str]]:
+    """Messages by identifier and whether that is an extended one, and the units of their channels.
+
+    A channel is ``Message.Signal``; where another message has that name already, the database's name comes first.
+    Raises InputError.
+    """
+    cantools = library("cantools.database", source, kind)
+    messages: dict[Identifier, list[_Message]] = {}
+    units: dict[str, str] = {}
+    taken: set[str] = set()
+    for path in databases:
+        text = read_regular(path, most=_MOST_DBC, need=_NEED_DBC).decode("cp1252", errors="replace")
+        with guarded(place(path), _NEED_DBC):
+            database = cantools.load_string(text, database_format="dbc", strict=False)
+            for message in database.messages:
+                if message.is_container:
+                    continue
+                prefix = f"{message.name}."
+                if any(prefix + signal.name in taken for signal in message.signals):
+                    prefix = f"{path.stem}.{message.name}."
+                if any(prefix + signal.name in taken for signal in message.signals):
+                    prefix = f"{path.stem}.{message.name}.{message.frame_id:X}."
+                channels = {signal.name: prefix + signal.name for signal in message.signals}
+                taken |= set(channels.values())
+                units |= {channels[signal.name]: signal.unit for signal in message.signals if signal.unit}
+                key = (message.frame_id, bool(message.is_extended_frame))
+                messages.setdefault(key, []).append(_Message(message, channels))
+    if not messages:
+        raise InputError(f"{listed(place(path) for path in databases)}: defines no message; {_NEED_DBC} is needed")
+    return messages, units

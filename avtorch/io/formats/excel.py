@@ -1,120 +1,168 @@
-"""Workbooks by python-calamine: Excel (xlsx, xlsm, xlsb, xls) and OpenDocument (ods), the first sheet with a table."""
+"""Workbooks by python-calamine: Excel (xlsx, xlsm, xlsb, xls) and OpenDocument (ods), the first sheet with a table.
+
+A table is a row of names, perhaps a row of units below it, then rows of numbers.
+"""
 
 from __future__ import annotations
 
+import datetime as dt
 import io
+import math
 import os
-import zipfile
-import zlib
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import chain, islice
+from typing import Any
 
 import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
-from avtorch.io.formats import kinds
-from avtorch.io.formats.excel_table import SheetTable, bare, table_of
 from avtorch.io.formats.kinds import Kind
 from avtorch.io.formats.library import guarded, library
-from avtorch.io.formats.listed import Listed
-from avtorch.io.formats.mat_tree import FINER, TIMES
-from avtorch.io.opening import place, read_regular
+from avtorch.io.formats.listed import Listed, refuse_cells
+from avtorch.io.formats.matlab import FINER, TIMES
+from avtorch.io.opening import MOST_BYTES, MOST_COLUMNS, place, read_regular
 from avtorch.io.recording import Channel
-from avtorch.io.size import MOST_BYTES
 
 _NEED = "an undamaged workbook"
-_MOST_INFLATED = 2 * 2**30  # bytes of all parts of a workbook
 _SCALES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+_AHEAD = 200  # rows searched for the names
+_EPOCH = dt.datetime(1970, 1, 1)
+_UNIT = re.compile(r"\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*$")
 
 
-class ExcelRecording(Listed):
-    """A sheet. Channels are its columns of numbers, called as in the row of names; NaN for an empty cell or a text.
+@dataclass(frozen=True)
+class SheetTable:
+    """Names, units and numbers ``(row, column)`` of a sheet; NaN for an empty cell and for a text."""
 
-    Time is the column called time, t, timestamp or the like, in seconds unless its unit says otherwise, since 1970
-    where its cells are dates. Rows without a time are left out.
+    names: tuple[str, ...]
+    units: dict[str, str]
+    numbers: FloatArray
+    texts: int
+    """Cells among the numbers that hold a text."""
+
+
+def open_file(path: str | os.PathLike[str], kind: Kind) -> Listed:
+    """Open a workbook; the sheet is read at once.
+
+    Channels are its columns of numbers, called as in the row of names; NaN for an empty cell or a text. Time is the
+    column called time, t, timestamp or the like, in seconds unless its unit says otherwise, since 1970 where its cells
+    are dates. Rows without a time are left out. Raises InputError.
     """
-
-    def __init__(
-        self,
-        source: str,
-        form: str,
-        time: FloatArray,
-        columns: Mapping[str, FloatArray],
-        units: Mapping[str, str],
-        remarks: Sequence[str],
-    ) -> None:
-        super().__init__(source, form, columns, units, remarks)
-        self._time, self._columns = time, columns
-
-    def _read(self, names: tuple[str, ...]) -> dict[str, Channel]:
-        time = self._time.copy()
-        return {name: Channel(name, time, self._columns[name].copy()) for name in names}
-
-
-def open_file(path: str | os.PathLike[str], kind: Kind) -> ExcelRecording:
-    """Open a workbook; the sheet is read at once. Raises InputError."""
     source = place(path)
-    raw = read_regular(path, most=MOST_BYTES, need=_NEED)
-    if kind is not kinds.XLS:
-        _check_zip(raw, source)
-    sheet, others, table = _first_table(raw, source, kind)
-    names, units, values = table.names, table.units, table.numbers.T
-    time_at = _time_column(names, source)
-    scale = _scale(names[time_at], units)
-    time = values[time_at] * scale if scale != 1.0 else values[time_at]
+    calamine = library("python_calamine", source, kind)
+    with guarded(source, _NEED):
+        book = calamine.load_workbook(io.BytesIO(read_regular(path, most=MOST_BYTES, need=_NEED)))
+        sheets = list(book.sheet_names)
+        tables = ((name, table_of(book.get_sheet_by_name(name).iter_rows(), source)) for name in sheets)
+        sheet, table = next(((name, one) for name, one in tables if one is not None and one.names), ("", None))
+    if table is None:
+        raise InputError(
+            f"{source}: no sheet has a row of names and rows of numbers below it; sheets: {listed(sheets)}"
+        )
+    plain = [_UNIT.sub("", name).strip().lower() for name in table.names]
+    at = next((plain.index(name) for name in (*TIMES, *FINER) if name in plain), None)
+    if at is None:
+        raise InputError(
+            f"{source}: no column is called {', '.join(TIMES[:4])} or the like; a time column is needed; "
+            f"columns: {listed(table.names)}"
+        )
+    scale = _SCALES.get(table.units.get(table.names[at], "").lower(), FINER.get(plain[at], 1.0))
+    time = table.numbers[:, at] * scale
     dated = ~np.isnan(time)
     remarks = []
-    if others:
-        remarks.append(f"sheet {quoted(sheet)} is read, {others} others are not")
+    if len(sheets) > 1:
+        remarks.append(f"sheet {quoted(sheet)} is read, {len(sheets) - 1} others are not")
     if table.texts:
         remarks.append(f"{table.texts} cells hold a text where a number is expected; they are NaN")
     if not dated.all():
         remarks.append(f"{int((~dated).sum())} rows without a time are left out")
-    columns = {name: values[i][dated] for i, name in enumerate(names) if i != time_at}
-    units = {name: unit for name, unit in units.items() if name in columns}
-    return ExcelRecording(source, kind.words, time[dated], columns, units, remarks)
+    time = time[dated]
+    columns = {name: table.numbers[dated, i] for i, name in enumerate(table.names) if i != at}
+    units = {name: unit for name, unit in table.units.items() if name in columns}
+    return Listed(
+        source, kind.words, columns, units, remarks,
+        lambda names: {name: Channel(name, time, columns[name]) for name in names},
+    )  # fmt: skip
 
 
-def _time_column(names: Sequence[str], source: str) -> int:
-    plain = [bare(name) for name in names]
-    for wanted in (*TIMES, *FINER):
-        if wanted in plain:
-            return plain.index(wanted)
-    raise InputError(
-        f"{source}: no column is called {', '.join(TIMES[:4])} or the like; a time column is needed; "
-        f"columns: {listed(names)}"
-    )
+def table_of(rows: Iterable[Sequence[Any]], source: str) -> SheetTable | None:
+    """The table of a sheet, None where there is none. Columns without any number are left out.
+
+    Raises InputError beyond 10,000 columns or 20 million cells.
+    """
+    left = iter(rows)
+    ahead = list(islice(left, _AHEAD))
+    for i, row in enumerate(ahead):
+        if not _is_header(row):
+            continue
+        below = next((k for k in range(i + 1, min(i + 3, len(ahead))) if _numbers(ahead[k]) >= 1), None)
+        if below is None or (below == i + 2 and _numbers(ahead[i + 1])):
+            continue
+        return _table(row, ahead[i + 1] if below == i + 2 else (), chain(ahead[below:], left), source)
+    return None
 
 
-def _scale(name: str, units: Mapping[str, str]) -> float:
-    unit = units.get(name, "").lower()
-    return _SCALES.get(unit, FINER.get(bare(name), 1.0))
+def _is_header(row: Sequence[Any]) -> bool:
+    texts = [cell for cell in row if cell != ""]
+    return len(texts) >= 2 and all(isinstance(cell, str) for cell in texts)
 
 
-def _check_zip(raw: bytes, source: str) -> None:
-    """Every part inflates to what the file says, and all of them to a bounded size."""
+def _numbers(row: Sequence[Any]) -> int:
+    return sum(not isinstance(cell, str) for cell in row)
+
+
+def _table(head: Sequence[str], below: Sequence[Any], rows: Iterable[Sequence[Any]], source: str) -> SheetTable:
+    places = [i for i, name in enumerate(head) if name.strip()]
+    if len(places) > MOST_COLUMNS:
+        raise InputError(f"{source}: has {len(places):,} columns; needs {MOST_COLUMNS:,} at most")
+    lines: list[list[float]] = []
+    texts = [0] * len(places)
+    for row in rows:
+        if all(cell == "" for cell in row):
+            continue
+        refuse_cells(source, (len(lines) + 1) * len(places))
+        line = [_number(row[i]) if i < len(row) else math.nan for i in places]
+        for k, i in enumerate(places):
+            texts[k] += i < len(row) and isinstance(row[i], str) and row[i] != "" and math.isnan(line[k])
+        lines.append(line)
+    numbers = np.array(lines, dtype=np.float64).reshape(len(lines), len(places))
+    kept = ~np.all(np.isnan(numbers), axis=0)
+    names: list[str] = []
+    units: dict[str, str] = {}
+    for i, is_number in zip(places, kept, strict=True):
+        if not is_number:
+            continue
+        name = base = head[i].strip()
+        count = 1
+        while name in names:
+            count += 1
+            name = f"{base} ({count})"
+        names.append(name)
+        unit = str(below[i]).strip() if i < len(below) else ""
+        if not unit and (match := _UNIT.search(base)) is not None:
+            unit = (match[1] if match[1] is not None else match[2]).strip()
+        unit = unit.strip("[]() ")
+        if unit:
+            units[name] = unit
+    return SheetTable(tuple(names), units, numbers[:, kept], sum(n for n, k in zip(texts, kept, strict=True) if k))
+
+
+def _number(cell: Any) -> float:
+    """A cell as a number: a date in seconds since 1970, a time of day or a span in seconds."""
+    if isinstance(cell, (bool, int, float)):
+        return float(cell)
+    if isinstance(cell, dt.datetime):
+        return (cell.replace(tzinfo=None) - _EPOCH) / dt.timedelta(seconds=1)
+    if isinstance(cell, dt.date):
+        return (dt.datetime(cell.year, cell.month, cell.day) - _EPOCH) / dt.timedelta(seconds=1)
+    if isinstance(cell, dt.timedelta):
+        return cell / dt.timedelta(seconds=1)
+    if isinstance(cell, dt.time):
+        return cell.hour * 3600 + cell.minute * 60 + cell.second + cell.microsecond / 1e6
     try:
-        with zipfile.ZipFile(io.BytesIO(raw)) as archive:
-            parts = archive.infolist()
-            total = sum(part.file_size for part in parts)
-            if total > _MOST_INFLATED or len(parts) > 10_000:
-                raise InputError(f"{source}: {len(parts):,} parts of {total:,} bytes; needs {_MOST_INFLATED:,} at most")
-            # reads each part in pieces, no further than it claims to go
-            broken = archive.testzip()
-    except (zipfile.BadZipFile, zlib.error, OSError, ValueError, EOFError, NotImplementedError, RuntimeError) as fault:
-        raise InputError(f"{source}: is damaged ({type(fault).__name__}: {fault}); {_NEED} is needed") from None
-    if broken is not None:
-        raise InputError(f"{source}: its part {quoted(broken)} is damaged; {_NEED} is needed")
-
-
-def _first_table(raw: bytes, source: str, kind: Kind) -> tuple[str, int, SheetTable]:
-    """The first sheet that holds a table, and the number of the other sheets."""
-    calamine = library("python_calamine", source, kind)
-    with guarded(source, _NEED):
-        book = calamine.load_workbook(io.BytesIO(raw))
-        sheets = list(book.sheet_names)
-        for name in sheets:
-            table = table_of(book.get_sheet_by_name(name).iter_rows(), source)
-            if table is not None and table.names:
-                return name, len(sheets) - 1, table
-    raise InputError(f"{source}: no sheet has a row of names and rows of numbers below it; sheets: {listed(sheets)}")
+        return float(cell)
+    except ValueError:
+        return math.nan

@@ -1,32 +1,38 @@
-"""What the recordings of all formats share: the listing, and the checks of what is asked of it."""
+"""What the recordings of all formats share: the listing, the checks of what is asked of it, and topics of messages."""
 
 from __future__ import annotations
 
 import difflib
-from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
+from array import array
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
 
+import numpy as np
+
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
+from avtorch.io.opening import MOST_CELLS, MOST_COLUMNS
 from avtorch.io.recording import Channel
-from avtorch.io.size import MOST_CELLS, MOST_COLUMNS
 
 
-class Listed(ABC):
-    """A `Recording` whose names are known. A format adds `_read`."""
+class Listed:
+    """A `Recording` whose names are known; `load` reads those that are asked for, each once, and at least one."""
 
     def __init__(
         self,
         source: str,
         form: str,
         names: Collection[str],
-        units: Mapping[str, str] | None = None,
-        remarks: Collection[str] = (),
+        units: Mapping[str, str],
+        remarks: Collection[str],
+        load: Callable[[tuple[str, ...]], dict[str, Channel]],
     ) -> None:
         self.source = source
         self.form = form
         self.names = tuple(names)
-        self.units: Mapping[str, str] = dict(units or {})
+        self.units: Mapping[str, str] = dict(units)
         self.remarks = tuple(remarks)
+        self._load = load
         self._known = frozenset(self.names)
         if not self.names:
             raise InputError(f"{source}: is {form} without any numeric channel; at least one is needed")
@@ -43,11 +49,9 @@ class Listed(ABC):
         for name in asked:
             if name not in self._known:
                 raise InputError(f"{self.source}: channel {quoted(name, 80)} is missing; {self._nearest(name)}")
-        return self._read(asked) if asked else {}
-
-    @abstractmethod
-    def _read(self, names: tuple[str, ...]) -> dict[str, Channel]:
-        """The channels of `names`, which are known, each once, and at least one."""
+        found = self._load(asked) if asked else {}
+        refuse_cells(self.source, sum(len(channel.values) for channel in found.values()))
+        return {name: found[name] for name in asked}
 
     def _nearest(self, name: str) -> str:
         near = difflib.get_close_matches(name, self.names[:MOST_COLUMNS], n=3, cutoff=0.5)
@@ -58,3 +62,56 @@ def refuse_cells(source: str, count: int) -> None:
     """Raises InputError where `count` samples are more than a reader takes."""
     if count > MOST_CELLS:
         raise InputError(f"{source}: has {count:,} samples in the channels that are read; needs {MOST_CELLS:,} at most")
+
+
+class Piece:
+    """What is read of one topic: a column for each field, the times of recording, and the stamps [s]."""
+
+    def __init__(self, columns: int) -> None:
+        self.columns = [array("d") for _ in range(columns)]
+        self.logged, self.stamped = array("d"), array("d")
+
+    def take(self, row: Sequence[float], logged: float, stamp: float | None) -> None:
+        """One message: its fields, when it was recorded, and the stamp where its type has one."""
+        for column, value in zip(self.columns, row, strict=True):
+            column.append(value)
+        self.logged.append(logged)
+        if stamp is not None:
+            self.stamped.append(stamp)
+
+    def time(self) -> FloatArray:
+        """The stamps, or the times of recording where a message has none or does not set it."""
+        stamped = np.array(self.stamped, dtype=np.float64)
+        return stamped if len(stamped) and (stamped > 0).all() else np.array(self.logged, dtype=np.float64)
+
+
+def topic_recording(
+    source: str,
+    form: str,
+    fields: Mapping[str, tuple[str, Any]],
+    remarks: Sequence[str],
+    collect: Callable[[Mapping[str, Sequence[Any]], Mapping[str, Piece]], None],
+) -> Listed:
+    """A recording of topics of messages, all fields of one topic on one clock.
+
+    `fields`: the topic and the path within its messages, by channel. `collect` puts the messages of topics into their
+    pieces, given the paths that are asked for by topic.
+    """
+    if len(fields) > MOST_COLUMNS:
+        remarks = [*remarks, f"only the first {MOST_COLUMNS:,} fields are listed"]
+        fields = dict(list(fields.items())[:MOST_COLUMNS])
+
+    def load(names: tuple[str, ...]) -> dict[str, Channel]:
+        asked: dict[str, list[str]] = {}
+        for name in names:
+            asked.setdefault(fields[name][0], []).append(name)
+        pieces = {topic: Piece(len(own)) for topic, own in asked.items()}
+        collect({topic: [fields[name][1] for name in own] for topic, own in asked.items()}, pieces)
+        found = {}
+        for topic, piece in pieces.items():
+            time = piece.time()
+            for name, column in zip(asked[topic], piece.columns, strict=True):
+                found[name] = Channel(name, time, np.array(column, dtype=np.float64))
+        return found
+
+    return Listed(source, form, fields, {}, remarks, load)

@@ -1,13 +1,17 @@
-"""MAT files: version 5 by SciPy, read when opened; version 7.3 by h5py, vectors read when asked for."""
+"""MAT files: version 5 by SciPy, version 7.3 by h5py, MATLAB's tables by mat-io; and which vector is the time of which.
+
+A file is a tree of structs. A signal is a vector with a time: one of as many samples in its own struct, or in one
+around it.
+"""
 
 from __future__ import annotations
 
+import importlib.util
+import math
 import os
-import weakref
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -15,171 +19,274 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats import kinds
 from avtorch.io.formats.kinds import Kind
-from avtorch.io.formats.library import guarded, library
+from avtorch.io.formats.library import guarded, library, reason
 from avtorch.io.formats.listed import Listed, refuse_cells
-from avtorch.io.formats.mat_tables import tables
-from avtorch.io.formats.mat_tree import TIMES, Found, Loaded, Matrix, Series, Tree, find_series, vector
-from avtorch.io.formats.opened import opened
-from avtorch.io.opening import place, read_regular
+from avtorch.io.opening import MOST_COLUMNS, opened, place
 from avtorch.io.recording import Channel
-from avtorch.io.size import MOST_BYTES, MOST_COLUMNS
+
+TIMES = ("time", "t", "timestamp", "timestamps", "time_s", "t_s", "tout", "seconds", "elapsed", "sec")
+"""Names of a time vector in seconds, in the order in which they are tried; capitals do not matter."""
+FINER = {"time_ms": 1e-3, "t_ms": 1e-3, "timestamp_ms": 1e-3, "time_us": 1e-6, "timestamp_us": 1e-6}
+FINER |= {"t_us": 1e-6, "time_ns": 1e-9, "timestamp_ns": 1e-9, "t_ns": 1e-9}
+"""Names that tell another unit, with that unit in seconds."""
 
 _NEED = "an undamaged MAT file"
 _NUMBERS = "fiub"  # kinds of numbers of NumPy
-_DEEPEST = 16
+_MOST_WIDE = 1000  # columns of a matrix that are channels
 _MOST_IN_ARRAY = 100  # elements of an array of structs, each of which is a struct of signals
-
-
-class MatRecording(Listed):
-    """A MAT file. Channels are vectors, by their path in structs as in ``log.speed``, columns as ``wheel(2)``.
-
-    Their time is a vector of as many samples called time, t, timestamp or the like, in the same struct or around it,
-    in seconds unless its name says ms, us or ns. A struct of Time and Data is one channel. A table is read as
-    a struct, a timetable with its times.
-    """
-
-    def __init__(self, source: str, form: str, found: Found, remarks: Sequence[str]) -> None:
-        if not found.series:
-            there = f"; vectors without one: {listed(found.untimed)}" if found.untimed else ""
-            raise InputError(
-                f"{source}: has no signal with a time{there}; a time vector is needed beside the signals, called "
-                f"{', '.join(TIMES[:4])}"
-            )
-        super().__init__(source, form, found.series, {}, remarks)
-        self._series = found.series
-
-    def _read(self, names: tuple[str, ...]) -> dict[str, Channel]:
-        refuse_cells(self.source, sum(int(np.prod(self._series[name].time.shape)) for name in names))
-        # the time and a matrix are read once for all channels that they have
-        loaded: dict[int, FloatArray] = {}
-        times: dict[tuple[int, float], FloatArray] = {}
-
-        def load(matrix: Matrix) -> FloatArray:
-            if id(matrix) not in loaded:
-                loaded[id(matrix)] = matrix.load()
-            return loaded[id(matrix)]
-
-        channels = {}
-        for name in names:
-            series: Series = self._series[name]
-            with guarded(f"{self.source}: channel {quoted(name, 80)}", _NEED):
-                key = (id(series.time), series.scale)
-                if key not in times:
-                    stamps = load(series.time).reshape(-1)
-                    times[key] = stamps * series.scale if series.scale != 1.0 else stamps.copy()
-                channels[name] = Channel(name, times[key], vector(series, load))
-        return channels
-
-
-def open_file(path: str | os.PathLike[str], kind: Kind) -> MatRecording:
-    """Open a MAT file and find its signals. Raises InputError."""
-    return _open_73(path, kind) if kind is kinds.MAT73 else _open_5(path)
-
-
-def _untimed(found: Found) -> list[str]:
-    return [f"left out, no time goes with them: {listed(found.untimed)}"] if found.untimed else []
-
-
-# version 5 --------------------------------------------------------------------------------------------------
-
-
-def _open_5(path: str | os.PathLike[str]) -> MatRecording:
-    source = place(path)
-    raw = read_regular(path, most=MOST_BYTES, need=_NEED)
-    if raw[126:128] not in (b"IM", b"MI"):
-        raise InputError(f"{source}: byte 127: {raw[126:128]!r} where IM or MI should be; {_NEED} is needed")
-    import io
-
-    from scipy.io import loadmat
-
-    with guarded(source, _NEED):
-        content = loadmat(io.BytesIO(raw), struct_as_record=True, squeeze_me=False, chars_as_strings=True)
-        objects: list[str] = []
-        tree = _tree_5({k: v for k, v in content.items() if not k.startswith("__")}, "", objects, 0)
-        also, lost = _tables(path, objects)
-        found = find_series({**tree, **also})
-    return MatRecording(source, "MAT 5", found, _untimed(found) + lost)
-
-
-def _tables(path: str | os.PathLike[str], objects: list[str]) -> tuple[dict[str, Tree], list[str]]:
-    return tables(path, [name for name in objects if "." in name]) if objects else ({}, [])
-
-
-def _tree_5(items: Any, path: str, objects: list[str], depth: int) -> Tree:
-    tree: dict[str, Any] = {}
-    for name, value in items.items():
-        full = f"{path}.{name}" if path else str(name)
-        kind = getattr(value, "dtype", np.dtype(object))
-        if type(value).__name__ in ("MatlabOpaque", "MatlabObject", "MatlabFunction"):
-            objects.append(full)
-        elif kind.names is not None and depth < _DEEPEST and value.size <= _MOST_IN_ARRAY:
-            flat = value.reshape(-1)
-            for k, one in enumerate(flat):
-                here = name if len(flat) == 1 else f"{name}({k + 1})"
-                tree[here] = _tree_5({n: one[n] for n in kind.names}, full, objects, depth + 1)
-        elif kind.names is None and kind.kind in _NUMBERS and isinstance(value, np.ndarray):
-            tree[str(name)] = Loaded(value)
-    return tree
-
-
-# version 7.3 ------------------------------------------------------------------------------------------------
+_DEEPEST = 16
+_TABLES = ("table", "timetable")
+_PLAIN = {"double", "single", "logical", "char", "cell", "struct", "sparse", "function_handle"}
+_PLAIN |= {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)}
 
 
 @dataclass(frozen=True, eq=False)
-class _Stored:
-    dataset: Any
-    shape: tuple[int, ...]
+class Matrix:
+    """Numbers of a `shape` as MATLAB shows it: an array, or a dataset of HDF5 that is not `transposed` yet."""
+
+    values: Any
+    transposed: bool = False
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(reversed(self.values.shape)) if self.transposed else self.values.shape
+
+    @property
+    def length(self) -> int:
+        return math.prod(self.shape)
+
+    @property
+    def is_vector(self) -> bool:
+        return self.length > 0 and self.length == max(self.shape, default=0)
 
     def load(self) -> FloatArray:
-        return np.array(self.dataset[()], dtype=np.float64).T
+        """The numbers, in that shape. Raises an error of the library where they are damaged."""
+        loaded = np.array(self.values[()], dtype=np.float64)
+        return loaded.T if self.transposed else loaded
 
 
-def _open_73(path: str | os.PathLike[str], kind: Kind) -> MatRecording:
+Tree: TypeAlias = "Mapping[str, Matrix | Tree]"
+
+
+@dataclass(frozen=True)
+class Series:
+    """One channel: a vector of a matrix, by its index along `axis` (-1: the matrix is one), and its time."""
+
+    matrix: Matrix
+    axis: int
+    index: int
+    time: Matrix
+    scale: float
+
+    def vector(self, whole: FloatArray) -> FloatArray:
+        """The samples of the channel (sample,), out of the numbers of its matrix."""
+        if self.axis < 0:
+            return whole.reshape(-1)
+        squeezed = whole.reshape([n for n in whole.shape if n != 1])
+        return np.asarray(squeezed.take(self.index, axis=self.axis), dtype=np.float64)
+
+
+def open_file(path: str | os.PathLike[str], kind: Kind) -> Listed:
+    """Open a MAT file and find its signals; vectors of version 7.3 are read when asked for.
+
+    Channels are vectors, by their path in structs as in ``log.speed``, columns as ``wheel(2)``. Their time is a vector
+    of as many samples called time, t, timestamp or the like, in the same struct or around it, in seconds unless its
+    name says ms, us or ns. A struct of Time and Data is one channel. A table is read as a struct, a timetable with its
+    times. Raises InputError.
+    """
     source = place(path)
-    h5py = library("h5py", source, kind)
-    stream = opened(Path(path), need=_NEED)
-    try:
-        with guarded(source, _NEED):
-            file = h5py.File(stream, "r")
-            objects: list[str] = []
-            tree = _tree_73(h5py, file, "", objects, 0, [0])
-            also, lost = _tables(path, objects)
-            found = find_series({**tree, **also})
-        recording = MatRecording(source, "MAT 7.3", found, _untimed(found) + lost)
-    except BaseException:
-        stream.close()
-        raise
-    weakref.finalize(recording, _close, file, stream)
-    return recording
+    objects: list[str] = []
+    form, opener = ("MAT 7.3", _tree_73) if kind is kinds.MAT73 else ("MAT 5", _tree_5)
+    with guarded(source, _NEED):
+        tree = opener(path, kind, objects)
+        also, lost = _tables(path, [name for name in objects if "." in name]) if objects else ({}, [])
+        found = _Found()
+        found.visit({**tree, **also}, "", None, 0)
+    if not found.series:
+        there = f"; vectors without one: {listed(found.untimed)}" if found.untimed else ""
+        raise InputError(
+            f"{source}: has no signal with a time{there}; a time vector is needed beside the signals, called "
+            f"{', '.join(TIMES[:4])}"
+        )
+
+    def load(names: tuple[str, ...]) -> dict[str, Channel]:
+        refuse_cells(source, sum(found.series[name].time.length for name in names))
+        # the time and a matrix are read once for all channels that they have
+        loaded: dict[int, FloatArray] = {}
+        times: dict[tuple[int, float], FloatArray] = {}
+        channels = {}
+        for name in names:
+            series = found.series[name]
+            with guarded(f"{source}: channel {quoted(name, 80)}", _NEED):
+                for matrix in (series.time, series.matrix):
+                    if id(matrix) not in loaded:
+                        loaded[id(matrix)] = matrix.load()
+                key = (id(series.time), series.scale)
+                times.setdefault(key, loaded[id(series.time)].reshape(-1) * series.scale)
+                channels[name] = Channel(name, times[key], series.vector(loaded[id(series.matrix)]))
+        return channels
+
+    untimed = [f"left out, no time goes with them: {listed(found.untimed)}"] if found.untimed else []
+    return Listed(source, form, found.series, {}, untimed + lost, load)
 
 
-def _close(file: Any, stream: Any) -> None:
-    file.close()
-    stream.close()
+def _tree_5(path: str | os.PathLike[str], kind: Kind, objects: list[str]) -> Tree:
+    from scipy.io import loadmat
+
+    with opened(path, need=_NEED) as stream:
+        order = stream.read(128)[126:128]
+        if order not in (b"IM", b"MI"):
+            raise InputError(f"{place(path)}: byte 127: {order!r} where IM or MI should be; {_NEED} is needed")
+        stream.seek(0)
+        content = loadmat(stream, struct_as_record=True, squeeze_me=False, chars_as_strings=True)
+
+    def tree_of(items: Mapping[str, Any], path: str, depth: int) -> Tree:
+        tree: dict[str, Any] = {}
+        for name, value in items.items():
+            full = f"{path}.{name}" if path else str(name)
+            kind = getattr(value, "dtype", np.dtype(object))
+            if type(value).__name__ in ("MatlabOpaque", "MatlabObject", "MatlabFunction"):
+                objects.append(full)
+            elif kind.names is not None and depth < _DEEPEST and value.size <= _MOST_IN_ARRAY:
+                flat = value.reshape(-1)
+                for k, one in enumerate(flat):
+                    here = name if len(flat) == 1 else f"{name}({k + 1})"
+                    tree[here] = tree_of({n: one[n] for n in kind.names}, full, depth + 1)
+            elif kind.names is None and kind.kind in _NUMBERS and isinstance(value, np.ndarray):
+                tree[str(name)] = Matrix(value)
+        return tree
+
+    return tree_of({k: v for k, v in content.items() if not k.startswith("__")}, "", 0)
 
 
-def _tree_73(h5py: Any, group: Any, path: str, objects: list[str], depth: int, count: list[int]) -> Tree:
+def _tree_73(path: str | os.PathLike[str], kind: Kind, objects: list[str]) -> Tree:
     """Groups are structs. Only what lies in the file itself is followed: no links elsewhere, no data beside it."""
-    tree: dict[str, Any] = {}
-    for name in group:
-        count[0] += 1
-        if count[0] > 10 * MOST_COLUMNS:
-            raise InputError(f"{path or 'the file'}: holds more than {10 * MOST_COLUMNS:,} variables")
-        if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            continue
-        full = f"{path}.{name}" if path else name
-        item = group[name]
-        if "MATLAB_object_decode" in item.attrs:
-            objects.append(full)
-        elif isinstance(item, h5py.Group):
-            if depth < _DEEPEST:
-                tree[name] = _tree_73(h5py, item, full, objects, depth + 1, count)
-        elif _is_number_73(item):
-            tree[name] = _Stored(item, tuple(reversed(item.shape)))
-    return tree
+    h5py = library("h5py", place(path), kind)
+    count = 0
+
+    def is_number(item: Any) -> bool:
+        if item.shape is None or item.dtype.kind not in _NUMBERS or item.external or item.is_virtual:
+            return False
+        return "MATLAB_empty" not in item.attrs and item.attrs.get("MATLAB_class", b"double") != b"char"
+
+    def tree_of(group: Any, path: str, depth: int) -> Tree:
+        nonlocal count
+        tree: dict[str, Any] = {}
+        for name in group:
+            count += 1
+            if count > 10 * MOST_COLUMNS:
+                raise InputError(f"{path or 'the file'}: holds more than {10 * MOST_COLUMNS:,} variables")
+            if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                continue
+            full = f"{path}.{name}" if path else name
+            item = group[name]
+            if "MATLAB_object_decode" in item.attrs:
+                objects.append(full)
+            elif isinstance(item, h5py.Group):
+                if depth < _DEEPEST:
+                    tree[name] = tree_of(item, full, depth + 1)
+            elif is_number(item):
+                tree[name] = Matrix(item, transposed=True)
+        return tree
+
+    return tree_of(h5py.File(opened(path, need=_NEED), "r"), "", 0)
 
 
-def _is_number_73(item: Any) -> bool:
-    if item.shape is None or item.dtype.kind not in _NUMBERS or item.external or item.is_virtual:
-        return False
-    return "MATLAB_empty" not in item.attrs and item.attrs.get("MATLAB_class", b"double") != b"char"
+def _tables(path: str | os.PathLike[str], nested: list[str]) -> tuple[dict[str, Tree], list[str]]:
+    """Tables of a file by name, each a tree of its columns and, for a timetable, ``time`` [s]; and remarks on what
+    cannot be read.
+
+    They are objects, whose layout in the file MATLAB does not publish. `nested`: objects that lie within structs, which
+    are not looked into.
+    """
+    if importlib.util.find_spec("matio") is None:
+        return {}, ["its tables and other objects are left out; tables need mat-io: pip install 'avtorch[mat]'"]
+    try:
+        import matio  # pyright: ignore[reportMissingTypeStubs]
+
+        library: Any = matio
+        classes = {name: kind for name, (_, kind) in library.whosmat(os.fspath(path)).items()}
+        wanted = [name for name, kind in classes.items() if kind in _TABLES]
+        content = library.load_from_mat(os.fspath(path), variable_names=wanted) if wanted else {}
+        trees: dict[str, Tree] = {
+            name: _columns(content[name]) for name in wanted if hasattr(content.get(name), "columns")
+        }
+    except Exception as fault:  # what else the file holds is read all the same
+        return {}, [f"its tables and other objects are left out, mat-io cannot read them: {reason(fault)}"]
+    lost = [name for name, kind in classes.items() if kind not in _PLAIN and name not in trees]
+    lost += nested
+    return trees, [f"timeseries and other objects cannot be read, save them as structs: {listed(lost)}"] if lost else []
+
+
+def _columns(frame: Any) -> dict[str, Matrix]:
+    """The numeric columns of a data frame; its index as ``time`` where that is of times."""
+    found: dict[str, Matrix] = {}
+    stamps = _seconds(frame.index.to_numpy())
+    if stamps is not None:
+        found["time"] = Matrix(stamps)
+    for name in frame.columns:
+        values = frame[name].to_numpy()
+        numbers = values if values.dtype.kind in _NUMBERS else _seconds(values)
+        if numbers is not None and str(name) not in found:
+            found[str(name)] = Matrix(numbers)
+    return found
+
+
+def _seconds(values: np.ndarray) -> np.ndarray | None:
+    """Dates and durations (row,) in seconds, as Unix time and as they are; None for anything else."""
+    if values.dtype.kind not in "mM":
+        return None
+    return values.astype("timedelta64[ns]" if values.dtype.kind == "m" else "datetime64[ns]").astype(np.int64) * 1e-9
+
+
+@dataclass
+class _Found:
+    """Channels by name, and the paths of those vectors that no time goes with."""
+
+    series: dict[str, Series] = field(default_factory=dict)
+    untimed: list[str] = field(default_factory=list)
+
+    def visit(self, tree: Tree, path: str, outer: tuple[str, Matrix, float] | None, depth: int) -> None:
+        """Take in the vectors of a tree; `outer`: name, numbers and unit [s] of the time around it."""
+        if depth > _DEEPEST or len(self.series) >= MOST_COLUMNS:
+            return
+        clock = _clock(tree) or outer
+        own = clock[0] if clock is not None and clock is not outer else None
+        values = [name for name in tree if name != own]
+        for name in values:
+            item = tree[name]
+            full = f"{path}.{name}" if path else name
+            if isinstance(item, Mapping):
+                self.visit(item, full, clock, depth + 1)
+            elif clock is None:
+                if item.length > 1:
+                    self.untimed.append(full)
+            else:
+                # a struct of Time and Data alone is one signal, called as the struct is
+                alone = path and own is not None and len(values) == 1 and name.lower() in ("data", "values", "value")
+                self._add(path if alone else full, item, *clock[1:])
+
+    def _add(self, name: str, item: Matrix, time: Matrix, scale: float) -> None:
+        samples = time.length
+        if samples < 2 and item.length < 2:
+            return
+        if item.is_vector and item.length == samples:
+            self.series[name] = Series(item, -1, 0, time, scale)
+            return
+        wide = [n for n in item.shape if n != 1]
+        if len(wide) == 2 and samples in wide:
+            axis = 1 if wide[0] == samples else 0  # columns first, where a matrix is square
+            for k in range(min(wide[axis], _MOST_WIDE, MOST_COLUMNS - len(self.series))):
+                self.series[f"{name}({k + 1})"] = Series(item, axis, k, time, scale)
+        elif item.length > 1:
+            self.untimed.append(name)
+
+
+def _clock(tree: Tree) -> tuple[str, Matrix, float] | None:
+    lower = {name.lower(): name for name in reversed(list(tree))}
+    for wanted, scale in [*((name, 1.0) for name in TIMES), *FINER.items()]:
+        name = lower.get(wanted)
+        item = tree[name] if name is not None else None
+        if name is not None and item is not None and not isinstance(item, Mapping) and item.is_vector:
+            return name, item, scale
+    return None

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
-import weakref
 from collections import Counter
-from collections.abc import Mapping
-from contextlib import suppress
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -17,10 +15,8 @@ from avtorch.errors import InputError, quoted
 from avtorch.io.formats.kinds import Kind
 from avtorch.io.formats.library import guarded, library
 from avtorch.io.formats.listed import Listed, refuse_cells
-from avtorch.io.formats.opened import beginning, in_memory, opened
-from avtorch.io.opening import place
+from avtorch.io.opening import MOST_BYTES, beginning, opened, place, read_regular
 from avtorch.io.recording import Channel
-from avtorch.io.size import MOST_BYTES
 
 _NEED = "an undamaged MDF 3 or 4 file"
 _NUMBERS_4 = frozenset(range(6))  # unsigned, signed and real, little and big end first; then texts, bytes, media
@@ -33,34 +29,39 @@ _INCOMPLETE = re.compile(r"Incomplete block at 0x([0-9a-f]+)")
 _MOST_CUT = 100  # blocks that the end of a file may cut: one of each group, where they lie behind each other
 
 
-class MdfRecording(Listed):
-    """An MDF file. `places` tells group and index of each name.
+def open_file(path: str | os.PathLike[str], kind: Kind) -> Listed:
+    """Open an MDF file and list its numeric channels that have a time.
 
     Samples are physical values; a channel whose values are named by texts is read as its raw numbers, and where texts
-    name a few values of a numeric channel only, those are NaN. Invalidation bits make NaN, too.
+    name a few values of a numeric channel only, those are NaN. Invalidation bits make NaN, too. A name that several
+    groups have becomes ``GROUP.NAME``, with the group's own name where that tells them apart, else its number as in
+    ``2.NAME``. Raises InputError.
     """
+    source = place(path)
+    asammdf = library("asammdf", source, kind)
+    remarks = []
+    # asammdf completes an unfinished file in place, so it gets a copy in memory
+    unfinished = beginning(path, 8, need=_NEED).startswith(b"UnFin")
+    with guarded(source, _NEED):
+        try:
+            mdf = _loaded(asammdf, _in_memory(path) if unfinished else opened(path, need=_NEED), whole=True)
+        except asammdf.blocks.utils.MdfException as fault:
+            if _INCOMPLETE.search(str(fault)) is None:
+                raise
+            mdf = _cut_off(asammdf, _in_memory(path), fault)
+            remarks.append("the file is cut off; what its end cuts is read as far as it goes, or left out")
+        if unfinished:
+            remarks.append("the recorder did not finish the file; it was completed as far as it goes")
+        listing = _Listing(mdf)
 
-    def __init__(
-        self,
-        source: str,
-        form: str,
-        mdf: Any,
-        places: Mapping[str, tuple[int, int]],
-        units: Mapping[str, str],
-        remarks: list[str],
-    ) -> None:
-        super().__init__(source, form, places, units, remarks)
-        self._mdf, self._places = mdf, dict(places)
-
-    def _read(self, names: tuple[str, ...]) -> dict[str, Channel]:
-        groups = self._mdf.groups
-        refuse_cells(self.source, sum(groups[self._places[name][0]].channel_group.cycles_nr for name in names))
+    def load(names: tuple[str, ...]) -> dict[str, Channel]:
+        refuse_cells(source, sum(mdf.groups[listing.places[name][0]].channel_group.cycles_nr for name in names))
         times: dict[int, FloatArray] = {}
         channels = {}
         for name in names:
-            group, index = self._places[name]
-            with guarded(f"{self.source}: channel {quoted(name, 80)}", _NEED):
-                signal = self._mdf.get(group=group, index=index, raw=True, ignore_invalidation_bits=True)
+            group, index = listing.places[name]
+            with guarded(f"{source}: channel {quoted(name, 80)}", _NEED):
+                signal = mdf.get(group=group, index=index, raw=True, ignore_invalidation_bits=True)
                 values = _physical(signal)
                 time = np.array(signal.timestamps, dtype=np.float64)
                 known = times.get(group)
@@ -69,47 +70,17 @@ class MdfRecording(Listed):
                 times[group] = time
                 if time.shape != values.shape:
                     raise InputError(
-                        f"{self.source}: channel {quoted(name, 80)}: has {len(time)} time stamps for "
+                        f"{source}: channel {quoted(name, 80)}: has {len(time)} time stamps for "
                         f"{len(values)} values; {_NEED} is needed"
                     )
                 channels[name] = Channel(name, time, values)
         return channels
 
+    return Listed(source, f"MDF {mdf.version}", listing.places, listing.units, remarks + listing.remarks, load)
 
-def open_file(path: str | os.PathLike[str], kind: Kind) -> MdfRecording:
-    """Open an MDF file and list its numeric channels that have a time.
 
-    A name that several groups have becomes ``GROUP.NAME``, with the group's own name where that tells them apart, else
-    its number as in ``2.NAME``. Raises InputError.
-    """
-    source = place(path)
-    asammdf = library("asammdf", source, kind)
-    remarks = []
-    # asammdf completes an unfinished file in place, so it gets a copy in memory
-    unfinished = beginning(path, 8, need=_NEED).startswith(b"UnFin")
-    stream = in_memory(path, most=MOST_BYTES, need=_NEED) if unfinished else opened(path, need=_NEED)
-    try:
-        with guarded(source, _NEED):
-            try:
-                mdf = _loaded(asammdf, stream, whole=True)
-            except asammdf.blocks.utils.MdfException as fault:
-                if _INCOMPLETE.search(str(fault)) is None:
-                    raise
-                stream.close()
-                stream = in_memory(path, most=MOST_BYTES, need=_NEED)
-                mdf = _cut_off(asammdf, stream, fault)
-                remarks.append("the file is cut off; what its end cuts is read as far as it goes, or left out")
-            if unfinished:
-                remarks.append("the recorder did not finish the file; it was completed as far as it goes")
-            listing = _Listing(mdf)
-        recording = MdfRecording(
-            source, f"MDF {mdf.version}", mdf, listing.places, listing.units, remarks + listing.remarks
-        )
-        weakref.finalize(recording, _close, mdf, stream)
-        return recording
-    except BaseException:
-        stream.close()
-        raise
+def _in_memory(path: str | os.PathLike[str]) -> io.BytesIO:
+    return io.BytesIO(read_regular(path, most=MOST_BYTES, need=_NEED))
 
 
 def _cut_off(asammdf: Any, stream: BinaryIO, fault: Exception) -> Any:
@@ -133,37 +104,10 @@ def _cut_off(asammdf: Any, stream: BinaryIO, fault: Exception) -> Any:
 
 
 def _loaded(asammdf: Any, stream: BinaryIO, *, whole: bool) -> Any:
-    """The file; `whole`: blocks that its end cuts are an error, and left out else.
-
-    What asammdf has built when it fails is closed, or it complains later.
-    """
-    option = "raise_on_incomplete_blocks"
-    before = asammdf.get_global_option(option)
-    asammdf.set_global_option(option, whole)
+    """The file; `whole`: blocks that its end cuts are an error, and left out else."""
+    asammdf.set_global_option("raise_on_incomplete_blocks", whole)
     stream.seek(0)
-    try:
-        return asammdf.MDF(stream, process_bus_logging=False)
-    except Exception as fault:
-        trace = fault.__traceback__
-        while trace is not None:
-            half: Any = trace.tb_frame.f_locals.get("self")
-            if hasattr(half, "groups") and hasattr(half, "close"):
-                for missing in ("header", "identification"):
-                    if not hasattr(half, missing):
-                        setattr(half, missing, None)
-                half.close()
-            trace = trace.tb_next
-        raise
-    finally:
-        asammdf.set_global_option(option, before)
-
-
-def _close(mdf: Any, stream: BinaryIO) -> None:
-    try:
-        with suppress(FileNotFoundError):  # its temporary file may have gone with another process
-            mdf.close()
-    finally:
-        stream.close()
+    return asammdf.MDF(stream, process_bus_logging=False)
 
 
 class _Listing:

@@ -11,7 +11,7 @@ import re
 import zlib
 
 from avtorch.errors import InputError
-from avtorch.io.size import MOST_BYTES
+from avtorch.io.opening import MOST_BYTES
 
 _BINARY = re.compile(rb"[\x00-\x08\x0b\x0e-\x1a\x1c-\x1f]")
 _PIECE = 2**20

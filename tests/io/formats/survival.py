@@ -16,7 +16,7 @@ from pathlib import Path
 from avtorch.child_process import limit_memory
 from avtorch.errors import InputError
 from avtorch.io.formats import apart_process, open_recording
-from avtorch.io.formats.recognise import kind_at
+from avtorch.io.formats.kinds import kind_at
 from avtorch.io.recording import Channel, Recording
 from tests.damage import KINDS, damaged
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import io
 import json
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.io.formats import apart, apart_process, open_recording
-from avtorch.io.formats.apart import ApartRecording
 
 from .survival import open_here
 from .test_bags import mcap
@@ -30,11 +30,19 @@ WRITERS = {
 }
 
 
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen]:
+    """The processes that were started."""
+    all_: list[subprocess.Popen] = []
+    start = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", lambda *given, **named: all_.append(start(*given, **named)) or all_[-1])
+    return all_
+
+
 @pytest.mark.parametrize("form", WRITERS)
 def test_the_answers_are_those_of_the_reader(tmp_path: Path, form: str) -> None:
     path = WRITERS[form](tmp_path / f"drive.{form}")
     there, here = open_recording(path), open_here(path)
-    assert isinstance(there, ApartRecording)
     assert (there.source, there.form, there.names) == (here.source, here.form, here.names)
     assert (there.units, there.remarks) == (here.units, here.remarks)
     expected = here.read(here.names)
@@ -76,11 +84,10 @@ def test_two_cells_that_claim_a_sheet_of_400_gb(tmp_path: Path) -> None:
         open_recording(path)
 
 
-def test_a_process_that_ends_between_two_readings(tmp_path: Path) -> None:
+def test_a_process_that_ends_between_two_readings(tmp_path: Path, started: list[subprocess.Popen]) -> None:
     recording = open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
-    assert isinstance(recording, ApartRecording)
     recording.read(["log.speed"])
-    recording._child._process.kill()
+    started[-1].kill()
     for _ in range(2):
         with pytest.raises(InputError, match=r"drive.mat: is damaged, .* \(SIGKILL\); an undamaged MAT file is needed"):
             recording.read(["log.speed"])
@@ -93,10 +100,9 @@ def test_a_process_that_takes_too_long(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.slow
-def test_the_process_ends_with_its_recording(tmp_path: Path) -> None:
+def test_the_process_ends_with_its_recording(tmp_path: Path, started: list[subprocess.Popen]) -> None:
     recording = open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
-    assert isinstance(recording, ApartRecording)
-    process = recording._child._process
+    process = started[-1]
     assert process.poll() is None
     del recording
     gc.collect()

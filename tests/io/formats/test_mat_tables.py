@@ -13,9 +13,9 @@ import pytest
 from avtorch.errors import InputError
 from avtorch.io import Log
 from avtorch.io.formats import open_recording
-from avtorch.io.formats.library import silenced
 
-with silenced():  # it sets an option of pandas that is no longer needed
+with warnings.catch_warnings():  # it sets an option of pandas that is no longer needed
+    warnings.simplefilter("ignore")
     import matio
 
 TIME = np.arange(150) / 30
@@ -56,20 +56,20 @@ def test_a_table_has_the_time_among_its_columns_beside_what_is_no_table(tmp_path
 
 
 def test_without_the_library_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from avtorch.io.formats import mat_tables
+    from avtorch.io.formats import matlab
 
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "matio" else real(name))
-    trees, remarks = mat_tables.tables(tmp_path / "drive.mat", [])
+    trees, remarks = matlab._tables(tmp_path / "drive.mat", [])
     assert trees == {}
     assert remarks == ["its tables and other objects are left out; tables need mat-io: pip install 'avtorch[mat]'"]
 
 
 def test_a_damaged_table_does_not_lose_the_rest(tmp_path: Path) -> None:
-    from avtorch.io.formats import mat_tables
+    from avtorch.io.formats import matlab
 
     (tmp_path / "drive.mat").write_bytes(b"MATLAB 5.0 MAT-file".ljust(200, b"\0"))
-    trees, remarks = mat_tables.tables(tmp_path / "drive.mat", [])
+    trees, remarks = matlab._tables(tmp_path / "drive.mat", [])
     assert trees == {}
     assert remarks[0].startswith("its tables and other objects are left out, mat-io cannot read them: ")
 

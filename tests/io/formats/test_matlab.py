@@ -15,7 +15,7 @@ from scipy.io import savemat
 
 from avtorch.errors import InputError
 from avtorch.io.formats import open_recording
-from avtorch.io.formats.matlab import _Stored
+from avtorch.io.formats.matlab import Matrix
 
 from .survival import open_here, refused, survives
 
@@ -117,8 +117,8 @@ def test_a_file_without_a_time(tmp_path: Path, version: str) -> None:
 def test_only_vectors_that_are_asked_for_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recording = open_here(mat73(tmp_path / "drive.mat", LOG))
     read: list[str] = []
-    load = _Stored.load
-    monkeypatch.setattr(_Stored, "load", lambda self: (read.append(self.dataset.name), load(self))[1])
+    load = Matrix.load
+    monkeypatch.setattr(Matrix, "load", lambda self: (read.append(self.values.name), load(self))[1])
     recording.read(["log.speed", "log.wheel(2)"])
     assert sorted(read) == ["/log/speed", "/log/time", "/log/wheel"]
 

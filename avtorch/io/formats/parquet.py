@@ -1,0 +1,103 @@
+"""Parquet by pyarrow: the columns that are asked for, within what a log may hold, as an Arrow stream."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from avtorch.errors import InputError, printable, quoted
+from avtorch.io.arrow_cells import MOST_TEXT, is_text, scalar_checks
+from avtorch.io.formats.kinds import Kind
+from avtorch.io.opening import MOST_BYTES, MOST_CELLS, MOST_COLUMNS, place, read_regular
+
+
+class ParquetFile:
+    """An opened file with the `names` of all its columns."""
+
+    def __init__(self, source: str, file: Any) -> None:
+        self.source, self._file = source, file
+        self.names: list[str] = file.schema_arrow.names
+        groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
+        if any(group.num_columns != file.metadata.num_columns for group in groups):
+            raise InputError(f"{source}: damaged Parquet file (a row group does not have the columns of the file)")
+
+    def stream(self, wanted: Collection[str]) -> bytes:
+        """The `wanted` columns, of names that occur once, in Arrow's format for streams.
+
+        Raises InputError for more than 20 million cells, for columns that hold no numbers, times or short texts, and
+        for damaged ones.
+        """
+        import pyarrow as pa
+
+        with damage(self.source):
+            table = self._table(wanted)
+            out = io.BytesIO()
+            with pa.ipc.new_stream(out, table.schema) as writer:
+                writer.write_table(table)
+            return out.getvalue()
+
+    def _table(self, wanted: Collection[str]) -> Any:
+        import pyarrow as pa
+        import pyarrow.compute as pc
+
+        count, rows, schema = Counter(self.names), self._file.metadata.num_rows, self._file.schema_arrow
+        kept = [name for name in self.names if name in wanted and count[name] == 1]
+        if rows * max(1, len(kept)) > MOST_CELLS:
+            raise InputError(
+                f"{self.source}: has {rows:,} rows of {len(kept)} columns that are read; "
+                f"needs {MOST_CELLS:,} cells at most"
+            )
+        for name in kept:
+            kind = schema.field(name).type
+            kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+            if not is_text(kind) and not any(check(kind) for check in scalar_checks()):
+                what = printable(str(kind), 40)
+                raise InputError(f"{self.source}: column {quoted(name)}: holds {what}; numbers are needed")
+        # a column is found by the first part of its path, so that one with a dot in its name comes along
+        found = self._file.read(columns=kept, use_threads=False)
+        if kept and found.num_rows != rows:
+            raise ValueError(f"{found.num_rows} rows where it declares {rows}")
+        columns = []
+        for name in kept:
+            column = found.column(found.schema.get_field_index(name))
+            if pa.types.is_dictionary(column.type):
+                column = column.cast(column.type.value_type)
+            if is_text(column.type):
+                longest = pc.max(pc.binary_length(column)).as_py() or 0  # pyright: ignore[reportAttributeAccessIssue]
+                if longest > MOST_TEXT:
+                    where = f"{self.source}: column {quoted(name)}"
+                    raise InputError(f"{where}: holds texts of {longest:,} bytes; numbers are needed")
+            columns.append(column)
+        table = pa.table(columns, names=kept)
+        table.validate(full=True)
+        return table
+
+
+def open_file(path: str | os.PathLike[str], kind: Kind) -> ParquetFile:
+    """Open a Parquet file and read its schema. Raises InputError."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    source = place(path)
+    raw = read_regular(path, most=MOST_BYTES, need="a CSV or Parquet file")
+    with damage(source):
+        found = ParquetFile(source, pq.ParquetFile(pa.BufferReader(raw)))
+    if len(found.names) > MOST_COLUMNS:
+        raise InputError(f"{source}: has {len(found.names):,} columns; needs {MOST_COLUMNS:,} at most")
+    return found
+
+
+@contextmanager
+def damage(source: str) -> Iterator[None]:
+    """Within it, an error of pyarrow becomes an InputError."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as fault:
+        reason = str(fault).splitlines()[0] if str(fault) else type(fault).__name__
+        raise InputError(f"{source}: damaged Parquet file ({printable(reason, 120)})") from None
