@@ -44,7 +44,7 @@ def _limited(
     start: FloatArray, parts: FloatArray, limit: FloatArray, slews: bool
 ) -> FloatArray:  # pragma: no cover - compiled
     """(column, time) of `parts` (part, 3, column, time): targets, lags and lengths."""
-    out = np.empty(parts.shape[2:])
+    out = np.empty((parts.shape[2], parts.shape[3]))
     for c in range(out.shape[0]):
         state, J = start[c], limit[c]
         for k in range(out.shape[1]):
