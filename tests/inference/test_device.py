@@ -73,7 +73,7 @@ def test_the_emulated_device_finds_a_tensor_made_without_a_device(elsewhere: Oth
     assert (x + torch.tensor(1.0)).tolist() == [2.0] * 3
 
 
-QUICK = ("jerk, switch", "points", "position lag")
+QUICK = ("jerk, switch", "points")
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,6 @@ def test_densities_and_modes(name: str, elsewhere: OtherDevice) -> None:
         pytest.param("points", "independent", marks=pytest.mark.slow),
         pytest.param("margin", "averaged", marks=pytest.mark.slow),
         pytest.param("own", "averaged", marks=pytest.mark.slow),
-        pytest.param("position lag", "averaged", marks=pytest.mark.slow),
     ],
 )
 def test_sampled(name: str, noise: Any, elsewhere: OtherDevice) -> None:

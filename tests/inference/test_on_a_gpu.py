@@ -54,7 +54,6 @@ def test_on_a_gpu_quadrature_is_the_same() -> None:
     ("name", "settings"),
     [
         ("jerk, switch", SamplerSettings()),
-        ("speed lag", SamplerSettings()),
         ("own", SamplerSettings()),
         ("points", SamplerSettings(batch=100, step=0.2, attempts=1)),
         ("points", SamplerSettings(noise="independent", step=0.2)),
@@ -104,7 +103,7 @@ def test_on_a_gpu_optimizers(optimizer: Any, options: dict[str, Any]) -> None:
 
 @pytest.mark.gpu
 @CUDA
-@pytest.mark.parametrize("name", ["jerk, quadrant", "position lag", "even rows"])
+@pytest.mark.parametrize("name", ["jerk, quadrant", "even rows"])
 def test_on_a_gpu_importance(name: str) -> None:
     found = []
     for device in ("cpu", "cuda"):
