@@ -1,7 +1,7 @@
 """One thread for the library's own work: its arrays are small, and threads that wait for each other take several times
 as long as one that does the work.
 
-The command line sets this before the libraries are loaded (`avtorch.cli.one_thread`); in a notebook or a script they
+The command line sets this before the libraries are loaded (`avtorch.cli.app`); in a notebook or a script they
 are loaded already, so it is set around the work and restored behind it.
 """
 

@@ -14,7 +14,7 @@ import torch
 
 from avtorch.cli import main
 from avtorch.io import Log, read_answer
-from avtorch.report.estimates_sentences import estimates_note
+from avtorch.report.estimates import estimates_note
 from avtorch.vehicle import GLVDPlant, Leader, simulate
 from tests.faulty_disk import visible
 

@@ -2,7 +2,7 @@
 
 import sys
 
-from avtorch.cli.process import run
+from avtorch.cli.app import process
 
 if __name__ == "__main__":
-    sys.exit(run())
+    sys.exit(process())

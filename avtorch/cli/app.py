@@ -5,20 +5,24 @@ The commands import torch and matplotlib only once their arguments are read: hel
 
 from __future__ import annotations
 
+import gc
+import inspect
+import os
+import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any
 
 from cyclopts import App, CycloptsError, MissingArgumentError
 
+from avtorch.cli.arguments import COMMAND_LINE, free_folder
 from avtorch.cli.check import check
 from avtorch.cli.check_simulator import check_simulator
-from avtorch.cli.command_line import given
 from avtorch.cli.compare import compare
 from avtorch.cli.diagnose import diagnose
 from avtorch.cli.estimate import estimate
 from avtorch.cli.fleet import fleet
-from avtorch.cli.one_thread import use_one_thread
-from avtorch.cli.out_folder import alone_in_out
 from avtorch.cli.paper import paper
 from avtorch.cli.run import run
 from avtorch.cli.stability import stability
@@ -34,9 +38,43 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
-app.command(check)
-app.command(check_simulator)
-app.command(watch)
+
+
+def alone_in_out(command: Callable[..., None]) -> Callable[..., None]:
+    """`command`, holding its `out` folder; it stays free where `out` is None.
+
+    A second process in the same folder gets one line (`InputError`) that names the first.
+    """
+    arguments = inspect.signature(command)
+
+    @wraps(command)
+    def held(*args: Any, **kwargs: Any) -> None:
+        given = arguments.bind(*args, **kwargs)
+        given.apply_defaults()
+        out = given.arguments["out"]
+        if out is None:
+            return command(*args, **kwargs)
+        from avtorch.io import sole_use
+        from avtorch.io.answer_set import published
+
+        free_folder(out)
+        before = len(published)
+        try:
+            with sole_use(out, work=f"avtorch {command.__name__}") as locked:
+                if not locked:
+                    warning = "the file system has no locks; keep other runs out of this folder"
+                    print(f"avtorch: {out}: {warning}", file=sys.stderr)
+                return command(*args, **kwargs)
+        except KeyboardInterrupt as stop:
+            if len(published) > before and not str(stop):
+                raise KeyboardInterrupt(f"the new answer is in {out}") from None
+            raise
+
+    return held
+
+
+for _command in (check, check_simulator, watch):
+    app.command(_command)
 for _command in (run, estimate, diagnose, compare, fleet, stability, validate, paper):
     app.command(alone_in_out(_command))
 
@@ -54,12 +92,25 @@ def _missing(fault: MissingArgumentError) -> str:
     return f"{argument.name}: missing; see avtorch {command} --help"
 
 
+def use_one_thread() -> None:
+    """Give torch and the linear algebra behind it one thread each, where the user has set no other number: tensors are
+    small here, and threads that wait for each other take several times as long.
+
+    `OMP_NUM_THREADS` sets all of them, another variable its own library. The libraries read these variables when they
+    are loaded: in a program that has loaded them before, nothing changes.
+    """
+    if "OMP_NUM_THREADS" in os.environ or not {"numpy", "torch"}.isdisjoint(sys.modules):
+        return
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
+
 def main(tokens: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0, 2 for bad input (one line on stderr), 130 when interrupted."""
     use_one_thread()
+    given = COMMAND_LINE.set(shlex.join(["avtorch", *(sys.argv[1:] if tokens is None else tokens)]))
     try:
-        with given(sys.argv[1:] if tokens is None else tokens):
-            app(tokens, exit_on_error=False, print_error=False)
+        app(tokens, exit_on_error=False, print_error=False)
     except (InputError, CycloptsError) as fault:
         # one line, however many the parser's own message has
         message = _missing(fault) if isinstance(fault, MissingArgumentError) else str(fault)
@@ -74,4 +125,20 @@ def main(tokens: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as stop:
         print(f"avtorch: interrupted; {printable(str(stop)) or 'no answer was written'}", file=sys.stderr)
         return 130
+    finally:
+        COMMAND_LINE.reset(given)
     return 0
+
+
+def process() -> int:
+    """`main` with the arguments of the process, as the installed `avtorch` starts it; returns its exit code.
+
+    Python looks for unreachable objects again and again while torch and matplotlib are imported, and once more for all
+    of them when the process ends. Modules stay until the end, so none is ever found; the search took a fifth of the
+    time of a short command.
+    """
+    gc.set_threshold(50_000, *gc.get_threshold()[1:])
+    try:
+        return main()
+    finally:
+        gc.freeze()  # no last search: the system takes the memory back

@@ -1,19 +1,25 @@
-"""Arguments that commands share, and the checks that turn a bad one into one line."""
+"""Arguments that commands share, and the checks that turn a bad one into one line; the command as it was given."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Group, Parameter, Token
 
 from avtorch.errors import InputError, quoted
 from avtorch.numeral import numeral
 
+if TYPE_CHECKING:
+    from avtorch.report import Origin
+
 OUTPUT = Group("Output", sort_key=9)
+COMMAND_LINE: ContextVar[str | None] = ContextVar("command_line", default=None)
+"""The command, quoted for a shell, for answers that tell how they were made; None outside one."""
 
 
 def whole_number(_: Any, tokens: Sequence[Token]) -> int:
@@ -51,6 +57,7 @@ Units = Annotated[
 Stamps = Annotated[
     list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
 ]
+Open = Annotated[bool, Parameter(name="--open", negative=(), group=OUTPUT, help="Show the page in your browser.")]
 Json = Annotated[bool, Parameter(name="--json", negative=(), group=OUTPUT, help="Print the answer as JSON, no tables.")]
 Quiet = Annotated[bool, Parameter(name=("--quiet", "-q"), negative=(), group=OUTPUT, help="Print nothing but errors.")]
 Seed = Annotated[int, Parameter(name="--seed", converter=whole_number, help="Seed of everything random.")]
@@ -75,24 +82,32 @@ def seed_number(seed: int) -> None:
         raise InputError(f"--seed: found {seed}, needs a whole number from 0 to 2^63 - 1")
 
 
-def three_gains(name: str, text: str) -> tuple[float, float, float]:
+def _numbers(name: str, text: str, count: int, needs: str, fits: Callable[[list[float]], bool]) -> list[float]:
+    """`count` finite numbers between commas, which `fits`. Raises `InputError` that says what it `needs`."""
     try:
-        values = tuple(numeral(part.strip()) for part in text.split(","))
+        values = [numeral(part.strip()) for part in text.split(",")]
     except ValueError:
-        values = ()
-    if len(values) != 3 or not all(map(math.isfinite, values)):
-        raise InputError(f"{name}: found {quoted(text)}, needs three numbers k_s,k_v,k_a such as 1.5,1.5,-0.8")
-    return values[0], values[1], values[2]
+        values = []
+    if len(values) != count or not all(map(math.isfinite, values)) or not fits(values):
+        raise InputError(f"{name}: found {quoted(text)}, needs {needs}")
+    return values
+
+
+def three_gains(name: str, text: str) -> tuple[float, float, float]:
+    k_s, k_v, k_a = _numbers(name, text, 3, "three numbers k_s,k_v,k_a such as 1.5,1.5,-0.8", lambda _: True)
+    return k_s, k_v, k_a
 
 
 def positive_pair(name: str, text: str, of: str, example: str) -> tuple[float, float]:
-    try:
-        values = tuple(numeral(part.strip()) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != 2 or not all(math.isfinite(x) and x > 0 for x in values):
-        raise InputError(f"{name}: found {quoted(text)}, needs two numbers {of} above 0 such as {example}")
-    return values[0], values[1]
+    one, two = _numbers(name, text, 2, f"two numbers {of} above 0 such as {example}", lambda x: min(x) > 0)
+    return one, two
+
+
+def limits_pair(name: str, text: str) -> tuple[float, float]:
+    """Two numbers, the first below zero and the second above."""
+    needs = "MIN,MAX [m/s²] below and above 0, such as -6,4"
+    low, high = _numbers(name, text, 2, needs, lambda x: x[0] < 0 < x[1])
+    return low, high
 
 
 def two_axes(text: str) -> tuple[str, str]:
@@ -120,12 +135,10 @@ def free_folder(out: Path, *, without: str | None = None) -> None:
             return
 
 
-def limits_pair(name: str, text: str) -> tuple[float, float]:
-    """Two numbers, the first below zero and the second above."""
-    try:
-        values = tuple(numeral(part.strip()) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != 2 or not all(map(math.isfinite, values)) or not values[0] < 0 < values[1]:
-        raise InputError(f"{name}: found {quoted(text)}, needs MIN,MAX [m/s²] below and above 0, such as -6,4")
-    return values[0], values[1]
+def origin_of(paths: Sequence[Path], **settings: Any) -> Origin:
+    """How an answer is made, by the files as they are now; a log's mapping file is one of them."""
+    from avtorch.io.mapping import mapping_beside
+    from avtorch.report import Origin
+
+    beside = [place for place in (mapping_beside(path) for path in paths) if place is not None]
+    return Origin.of(COMMAND_LINE.get(), [*paths, *beside], settings)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from avtorch.cli.arguments import OUTPUT, Columns, Json, Quiet, Units
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError
+
+if TYPE_CHECKING:
+    from avtorch.logcheck.check import LogCheck
 
 
 def check(
@@ -42,7 +45,7 @@ def check(
     talk = Talk(json=json, quiet=quiet)
     found = work(log, map=map, unit=unit)
     proposal, beside = found.proposal, mapping_place(log)
-    talk.check(found)
+    _print(talk, found)
     if json and not quiet:
         talk.answer(found.to_dict())
     if found.follows:
@@ -62,6 +65,24 @@ def check(
         talk.line(f"It needs no mapping. Next: avtorch estimate {log}, or avtorch diagnose {log}")
     if found.fault is not None:
         raise InputError(found.fault)
+
+
+def _print(talk: Talk, found: LogCheck) -> None:
+    """What a log is, how to read it, and what was seen in it."""
+    from avtorch.report.table import Table
+
+    talk.line(found.source, "bold")
+    talk.lines([f"  {found.form}", ""])
+    proposal = found.proposal
+    if proposal is not None and proposal.signals:
+        rows = [(signal, one.column, one.unit or "", one.reason) for signal, one in proposal.signals.items()]
+        talk.table(Table("The mapping", ("signal", "column", "unit", "why"), tuple(rows)))
+    if proposal is not None:
+        talk.lines([f"In doubt: {doubt}" for doubt in proposal.doubts], "yellow")
+    seen = () if found.quality is None else found.quality.notes
+    for title, notes in (("Seen", seen), ("Recorder", found.recorder), ("Excitation", found.excitation)):
+        if notes:
+            talk.notes(title, notes)
 
 
 def _agreed(talk: Talk, beside: Path) -> bool:

@@ -7,31 +7,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
-from rich.markup import escape
-from rich.table import Table
 
-from avtorch.cli.arguments import OUTPUT, Columns, Json, Quiet, Units, free_folder, local_folder
-from avtorch.cli.browser import Open, show
-from avtorch.cli.command_line import origin_of
-from avtorch.cli.simulator import read_simulator
-from avtorch.cli.simulators_table import simulators_table
+from avtorch.cli.arguments import (
+    OUTPUT,
+    Columns,
+    Json,
+    Open,
+    Quiet,
+    Units,
+    free_folder,
+    local_folder,
+    origin_of,
+)
+from avtorch.cli.simulators import read_simulator, simulator_of, simulators_of
 from avtorch.cli.talk import Talk
-from avtorch.cli.tested_simulator import simulator_of, simulators_of
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
     from avtorch.external import SimulatorComparison
-    from avtorch.gap.result.comparison import Change, Comparison
+    from avtorch.gap.result.comparison import Comparison
     from avtorch.io import Log
     from avtorch.report import Origin
 
 PAGE = "comparison.html"
-_ROWS = {
-    "T_L": "lag T_L [s]",
-    "K_L": "gain K_L [-]",
-    "rollout_rmse_accel": "acceleration error, {horizon} s [m/s²]",
-    "rollout_rmse_speed": "speed error, {horizon} s [m/s]",
-}
 
 
 def compare(
@@ -99,10 +97,15 @@ def compare(
             raise InputError("--baseline: found beside --simulator or --simulated, needs a plant as --simulator")
         talk = Talk(json=json, quiet=quiet)
         log = _log(before, map, unit, talk)
-        found = _nearer(talk, before, log, simulator or (), simulated or (), step)
+        first, second = simulators_of(simulator or (), simulated or (), step, before, log)
+
+        from avtorch.external import compare_simulators
+
+        with talk.progress("Comparing") as step_done:
+            found = compare_simulators(log, first, second, progress=step_done)
         files = [before, *_files([*two])]
         origin = origin_of(files, map=map, unit=unit, simulator=simulator, simulated=simulated, step=step)
-        _answer(talk, found, simulators_table(found), out, [log], origin, open_page)
+        _answer(talk, found, out, [log], origin, open_page)
         if not talk.json:
             for which in (x for x in (found.first, found.second) if x.notes):
                 talk.notes(which.name, which.notes)
@@ -122,7 +125,7 @@ def compare(
     logs = [_log(path, map, unit, talk) for path in (before, after)]
     drives = [(before, logs[0]), (after, logs[1])]
     own = simulator_of(simulated or (), (simulator or (None,))[0], step, drives, adjust=(), rollouts=None, processes=1)
-    with talk.steps("Comparing") as step_done:
+    with talk.progress("Comparing") as step_done:
         comparison = work(*logs, baseline=own or base, baseline_after=other, progress=step_done)
     origin = origin_of(
         [before, after, *_files([*two, baseline, baseline_after or ""])],
@@ -133,19 +136,7 @@ def compare(
         step=step,
         baseline=[baseline, baseline_after],
     )
-    _answer(talk, comparison, _table(comparison), out, logs, origin, open_page)
-
-
-def _nearer(
-    talk: Talk, path: Path, log: Log, simulator: Sequence[str], simulated: Sequence[str], step: float | None
-) -> SimulatorComparison:
-    """Two simulators and a log."""
-    first, second = simulators_of(simulator, simulated, step, path, log)
-
-    from avtorch.external import compare_simulators
-
-    with talk.steps("Comparing") as step_done:
-        return compare_simulators(log, first, second, progress=step_done)
+    _answer(talk, comparison, out, logs, origin, open_page)
 
 
 def _files(sources: Sequence[str]) -> list[Path]:
@@ -167,13 +158,13 @@ def _log(path: Path, map: list[str] | None, unit: list[str] | None, talk: Talk) 
 def _answer(
     talk: Talk,
     found: Comparison | SimulatorComparison,
-    table: Table,
     out: Path | None,
     logs: Sequence[Log],
     origin: Origin,
     open_page: bool,
 ) -> None:
     from avtorch.io import answer_set, check, write_json
+    from avtorch.report.comparison import comparison_tables
 
     if out is not None:
         from avtorch.report import write_comparison_page
@@ -183,56 +174,11 @@ def _answer(
             write_comparison_page(found, staged, notes=notes, origin=origin)
             write_json(staged / "comparison.json", found.to_dict())
         if open_page:
-            show(out / PAGE, talk)
-    if talk.json:
-        talk.answer(found.to_dict())
-        return
-    talk.out.print(f"[bold]{escape(found.why)}[/bold]")
-    talk.out.print()
-    talk.out.print(table)
+            talk.show(out / PAGE)
+    talk.lines([found.why, ""], "bold")
+    for table in () if talk.silent else comparison_tables(found):
+        talk.table(table)
     if out is not None:
-        talk.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {PAGE}, comparison.json", soft_wrap=True)
-
-
-def _table(comparison: Comparison) -> Table:
-    table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
-    table.add_column("")
-    for name in ("before", "after", "after / before (90 %)"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for name, moved in {**comparison.car, **comparison.gap}.items():
-        row = _ROWS.get(name, name).format(horizon=f"{comparison.horizon_s:.3g}")
-        table.add_row(escape(row), *_cells(moved))
-    for label, value in _of_cause(comparison):
-        table.add_row(escape(label), "", "", escape(value))
-    return table
-
-
-def _of_cause(comparison: Comparison) -> list[tuple[str, str]]:
-    """Rows of the cause: what has changed, by how much, with which probability; or the least change that would show."""
-    from avtorch.gap.answer.change import detectable_text
-    from avtorch.gap.quantity import unit_of, words_of
-
-    cause = comparison.cause
-    if cause is None:
-        return []
-    if not cause.parts:
-        least = cause.detectable.items()
-        return [(f"least change of {name} that would show", detectable_text(name, value)) for name, value in least]
-    rows: list[tuple[str, str]] = []
-    for part in cause.parts:
-        others = [name for name in part.alias_set if name != part.name]
-        alike = f" (or {', '.join(others)})" if others else ""
-        rows.append((f"cause: {'less ' if part.less else ''}{part.name}{alike}", f"probability {part.probability:.2f}"))
-        for key, q in part.parameters.items():
-            unit = unit_of(key)
-            name = f"  {words_of(key)}" + ("" if unit == "-" else f" [{unit}]")
-            rows.append((name, f"{q.mean:.3g} ({q.q05:.3g} to {q.q95:.3g})"))
-    return rows
-
-
-def _cells(moved: Change) -> list[str]:
-    r = moved.ratio
-    return [
-        *(f"{q.mean:.3g}" for q in (moved.before, moved.after)),
-        f"{r.mean:.2f} ({r.q05:.2f} to {r.q95:.2f})",
-    ]
+        talk.done(out, found.to_dict(), [PAGE, "comparison.json"])
+    elif talk.json:
+        talk.answer(found.to_dict())

@@ -10,30 +10,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Group, Parameter
-from rich.markup import escape
 
 from avtorch.cli.arguments import (
     OUTPUT,
     Columns,
     Json,
+    Open,
     Quiet,
     Seed,
     Stamps,
     Units,
     free_folder,
     local_folder,
+    origin_of,
     positive,
     seed_number,
 )
-from avtorch.cli.browser import Open, show
-from avtorch.cli.command_line import origin_of
-from avtorch.cli.diagnosis_table import budget_table, diagnosis_headline, diagnosis_notes, diagnosis_table
-from avtorch.cli.follower import follow, refuse
+from avtorch.cli.follower import follow, print_diagnosis, refuse
 from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.pedals import commanded, write_pedals
-from avtorch.cli.simulator import read_simulator
+from avtorch.cli.simulators import read_simulator, refuse_loop, simulator_of
 from avtorch.cli.talk import Talk
-from avtorch.cli.tested_simulator import refuse_loop, simulator_of
 from avtorch.errors import InputError, quoted
 from avtorch.numeral import numeral
 
@@ -205,10 +202,10 @@ def diagnose(
         refuse(logs, **idle, **{option: value is not None for option, value in track.items()})
         source = {"map": map, "unit": unit, "stamp": stamp, "vehicle": vehicle, "event": event}
         origin = origin_of(logs, **source, law=law, effects=chosen, seed=seed)
-        with talk.whole("Diagnosing") as done:
+        with talk.progress("Diagnosing") as done:
             follow(talk, logs[0], out, source=source, law=law, effects=chosen, seed=seed, step=done, origin=origin)
         if open_page:
-            show(out / "report.html", talk)
+            talk.show(out / "report.html")
         return
     for option, given in (("--vehicle", vehicle), ("--law", law), ("--event", event)):
         if given is not None:
@@ -254,7 +251,7 @@ def diagnose(
     )
     from avtorch.gap.diagnose import diagnose as work
 
-    with talk.whole("Diagnosing", budget) as done:
+    with talk.progress("Diagnosing", budget) as done:
         found = work(
             drives,
             baseline=own or assumed,
@@ -296,21 +293,10 @@ def diagnose(
         written.append(write_report(found, staged, quality=quality, experiment=ahead, origin=origin))
         written += write_pedals(fit, staged)
     if open_page:
-        show(out / "report.html", talk)
-    if talk.json:
-        talk.done(out, found.to_dict())
-        return
-    talk.out.print(*diagnosis_headline(found), sep="\n")
-    talk.out.print()
-    if found.budget is not None and found.budget.says_something:
-        talk.out.print(budget_table(found.budget, found.log.epochs_s[0]))
-        talk.out.print()
-    talk.out.print(diagnosis_table(found))
-    talk.out.print()
-    for note in diagnosis_notes(found):
-        talk.out.print(note)
-    names = [p.name + _FILES.get(p.name, _FILES.get(p.suffix, "")) for p in written]
-    talk.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {', '.join(names)}", soft_wrap=True)
+        talk.show(out / "report.html")
+    if not talk.json:
+        print_diagnosis(talk, found)
+    talk.done(out, found.to_dict(), [p.name + _FILES.get(p.name, _FILES.get(p.suffix, "")) for p in written])
 
 
 _FILES = {

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TextIO
 
 from cyclopts import Parameter
 
@@ -11,6 +13,7 @@ from avtorch.cli.arguments import (
     Columns,
     Gains,
     Json,
+    Open,
     Out,
     Quiet,
     Seed,
@@ -19,21 +22,28 @@ from avtorch.cli.arguments import (
     Units,
     free_folder,
     not_negative,
+    origin_of,
     positive,
     positive_pair,
     seed_number,
     three_gains,
 )
-from avtorch.cli.browser import Open, show
-from avtorch.cli.command_line import origin_of
 from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.pedals import commanded, write_pedals
-from avtorch.cli.resume import WINDOWS, begin_anew
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
-    pass
+    from avtorch.decision.watch import WatchedWindow
+
+PAGE = "estimates.html"
+STATE = "windows.state"
+"""Finished windows, and the belief behind them. The estimate keeps them and compares what they belong to with its
+settings."""
+LINES = "windows.jsonl"
+"""One line a window, each an entry of `windows` in `estimates.json`, which takes its place in the end."""
+PASSING_ON = ("auto", "sgld", "importance", "map")
+"""Estimators whose posteriors become priors, so that `--mode` has a meaning."""
 
 
 def estimate(
@@ -101,7 +111,6 @@ def estimate(
     if mode != "lambda" and estimator not in PASSING_ON:
         raise InputError(f"--mode: has no meaning with --estimator {estimator}, which passes no prior on; leave it out")
 
-    from avtorch.cli.finished_windows import finished_windows
     from avtorch.decision.estimation import estimate as work
     from avtorch.decision.settings import Setting
     from avtorch.io import Log, check
@@ -114,17 +123,17 @@ def estimate(
     (drive,), fit, about_map = commanded(talk, [drive])
     setting = Setting(time_gap=tau, gains=k, scenarios=1)
     if not resume:
-        begin_anew(out, WINDOWS)
+        _begin_anew(out / STATE)
     options: dict[str, Any] = {"mode": mode} if estimator in PASSING_ON else {}
     options |= {"form": form, "setting": setting, "dead_time": dead_time, "seed": seed, "accepted": sound}
-    options |= {"estimator": estimator, "align": align, "checkpoint": out / WINDOWS}
+    options |= {"estimator": estimator, "align": align, "checkpoint": out / STATE}
     try:
         with talk.progress("Estimating") as step, finished_windows(out) as written:
             found = work(drive, window, progress=step, finished=written, **options)
     except KeyboardInterrupt:
-        if (out / WINDOWS).exists():
+        if (out / STATE).exists():
             message = (
-                f"no answer was written; finished windows are kept in {out / WINDOWS}: the same command resumes there"
+                f"no answer was written; finished windows are kept in {out / STATE}: the same command resumes there"
             )
             raise KeyboardInterrupt(message) from None
         raise
@@ -134,7 +143,8 @@ def estimate(
 
     from avtorch import plots
     from avtorch.report import write_estimates_page
-    from avtorch.report.estimates_sentences import dead_time_note, estimates_note, late_note
+    from avtorch.report.estimates import dead_time_note, estimates_note, late_note
+    from avtorch.report.window_tables import P_WORDS, alert_table, window_table
 
     origin = origin_of(
         [log], window=window, map=map, unit=unit, stamp=stamp, **options | {"setting": [tau, *k], "checkpoint": None}
@@ -151,17 +161,49 @@ def estimate(
     }
     write_answer(out, "estimates.json", answer, pictures, more=page, also=(PAGE, *PEDAL_FILES))
     if open_page:
-        show(out / PAGE, talk)
+        talk.show(out / PAGE)
     printed = answer | {key: from_start(answer[key], answer["epoch_s"]) for key in ("windows", "alerts")}
-    talk.windows(printed["windows"])
-    talk.summary(printed, estimates_note(answer))
-    for text in (late_note(found.late), dead_time_note(found.inferred), answer["estimator_note"]):
-        if text:
-            talk.sentence(text)
+    talk.table(window_table(printed["windows"]), most=60)
+    talk.lines([P_WORDS], "dim")
+    talk.lines([estimates_note(answer)])
+    if printed["alerts"]:
+        talk.table(alert_table(printed["alerts"]))
+    more = (late_note(found.late), dead_time_note(found.inferred), answer["estimator_note"])
+    talk.lines([text for text in more if text])
     talk.done(out, answer)
 
 
-PASSING_ON = ("auto", "sgld", "importance", "map")
-"""Estimators whose posteriors become priors, so that `--mode` has a meaning."""
+def _begin_anew(path: Path) -> None:
+    """Remove what is kept there. Raises `InputError` where something else has such a name."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as fault:
+        raise InputError(f"--no-resume: {path} cannot be removed ({fault.strerror}); needs another folder") from None
 
-PAGE = "estimates.html"
+
+@contextmanager
+def finished_windows(out: Path) -> Iterator[Callable[[WatchedWindow], None]]:
+    """A function that writes a window to `LINES` in `out`; the file is removed where no exception is raised.
+
+    After an interruption it holds the windows finished by then. Raises `InputError` where it cannot be written.
+    """
+    from avtorch.io.answers import json_text
+    from avtorch.results import window_entry
+
+    path = out / LINES
+    with ExitStack() as opened:
+        streams: list[TextIO] = []
+
+        def write(window: WatchedWindow) -> None:
+            try:
+                if not streams:  # not before there is something to write: a refused log leaves no folder
+                    out.mkdir(parents=True, exist_ok=True)
+                    streams.append(opened.enter_context(path.open("w", encoding="utf-8")))
+                streams[0].write(json_text(window_entry(window), indent=None).strip() + "\n")
+                streams[0].flush()
+            except OSError as fault:
+                raise InputError(f"{path}: cannot be written ({fault.strerror}); windows go there when done") from None
+
+        yield write
+    if streams:
+        path.unlink(missing_ok=True)

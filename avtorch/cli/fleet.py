@@ -8,17 +8,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
-from rich.markup import escape
-from rich.table import Table
 
 from avtorch.cli.arguments import (
+    COMMAND_LINE,
     OUTPUT,
+    Columns,
     Gains,
     Json,
+    Open,
     Quiet,
     Seed,
     Stamps,
     TimeGap,
+    Units,
     free_folder,
     local_folder,
     positive,
@@ -26,10 +28,8 @@ from avtorch.cli.arguments import (
     seed_number,
     three_gains,
 )
-from avtorch.cli.browser import Open, show
-from avtorch.cli.command_line import command_line
 from avtorch.cli.diagnose import chosen_effects
-from avtorch.cli.simulator import read_simulator
+from avtorch.cli.simulators import read_simulator
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError, quoted
 
@@ -58,13 +58,8 @@ def fleet(
     only: Annotated[
         str | None, Parameter(help="Only these steps, STEP,STEP of check, estimate and diagnose; default: all.")
     ] = None,
-    map: Annotated[
-        list[str] | None,
-        Parameter(negative=(), help="Name of a column in all logs, SIGNAL=COLUMN; repeatable."),
-    ] = None,
-    unit: Annotated[
-        list[str] | None, Parameter(negative=(), help="Unit of a column in all logs, SIGNAL=UNIT; repeatable.")
-    ] = None,
+    map: Columns = None,
+    unit: Units = None,
     stamp: Stamps = None,
     window: Annotated[float, Parameter(help="Length of a window [s].")] = 2.0,
     estimator: Annotated[
@@ -168,7 +163,7 @@ def fleet(
             talk.line(f"Dask's dashboard: {cluster.dashboard}")
 
     try:
-        with talk.whole("Fleet") as step:
+        with talk.progress("Fleet") as step:
             answer = run_fleet(
                 found,
                 out,
@@ -183,9 +178,9 @@ def fleet(
             )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"finished rows are kept in {out}: the same command does what is missing") from None
-    page_path = write_fleet_page(answer, out, origin=Origin.of(command_line(), settings=asdict(settings)))
+    page_path = write_fleet_page(answer, out, origin=Origin.of(COMMAND_LINE.get(), settings=asdict(settings)))
     if open_page:
-        show(page_path, talk)
+        talk.show(page_path)
     if talk.json:
         talk.answer(answer)
         return
@@ -218,45 +213,17 @@ def _many(count: int, word: str) -> str:
 
 def _print(talk: Talk, answer: dict[str, Any]) -> None:
     """The first cars, in the order in which to look at them, and what failed."""
-    table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("car", "why", "P", "T_L [s]", "K_L", "change", "simulator lacks", "logs"):
-        table.add_column(escape(name), justify="right" if name in ("P", "T_L [s]", "K_L", "logs") else "left")
-    for car in answer["cars"][:SHOWN]:
-        table.add_row(
-            escape(car["car"]),
-            car["reason"],
-            "" if car["p_string_stable"] is None else f"{car['p_string_stable']['now']:.2f}",
-            *("" if car[name] is None else f"{car[name]['mean']:.3f}" for name in ("T_L", "K_L")),
-            _change(car["change"]),
-            "" if car["gap"] is None else escape(", ".join(car["gap"]["verdict"])),
-            str(len(car["logs"])),
-            style=_STYLE.get(car["reason"]),
-        )
-    talk.out.print(table)
-    more = len(answer["cars"]) - SHOWN
-    if more > 0:
-        talk.line(f"... and {_many(more, 'more car')} in fleet.json")
-    errors = [
-        (log["log"], why) for car in answer["cars"] for log in car["logs"] for why in [*log["errors"].values()][:1]
-    ]
-    if errors:
-        talk.line("")
-    for place, why in errors[:5]:
+    from avtorch.report.fleet import failure_table, ranking_table
+
+    if talk.silent:
+        return
+    talk.table(ranking_table(answer["cars"]), most=SHOWN)
+    failures = failure_table(answer)
+    for place, _, _, why in () if failures is None else failures.rows[:5]:
         talk.line(f"Failed: {why if place in why or os.path.basename(place) in why else f'{place}: {why}'}")
-    if len(errors) > 5:
-        talk.line(f"... and {_many(len(errors) - 5, 'more log')} failed, see fleet.json")
+    if failures is not None and len(failures.rows) > 5:
+        talk.line(f"... and {_many(len(failures.rows) - 5, 'more log')} failed, see fleet.json")
     for note in answer["notes"]:
         talk.line(note)
     done = answer["work"]
     talk.line(f"\n{_many(done['computed'], 'answer')} computed, {done['kept']} kept from earlier runs.")
-
-
-_STYLE = {"below target": "bold yellow", "failed": "red", "changed": "yellow", "unlike siblings": "yellow"}
-_STYLE |= {"no answer": "dim"}
-
-
-def _change(change: dict[str, Any] | None) -> str:
-    if change is None:
-        return ""
-    name, most = max(change.items(), key=lambda item: item[1]["in_sd"])
-    return f"{name} {most['difference']:+.2f} ({most['in_sd']:.1f} SD)"

@@ -7,16 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.markup import escape
-from rich.table import Table
-
-from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes
 from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
+    from avtorch.gap.result.diagnosis import Diagnosis
     from avtorch.report import Origin
+    from avtorch.report.table import Table
 
 
 def refuse(logs: Sequence[Path], **given: object) -> None:
@@ -64,28 +62,46 @@ def follow(
         written = [*gap.write(staged), *write_exports(gap.plant, staged)]
         write_json(staged / "diagnosis.json", answer)
         written.append(write_report(gap, staged, quality=noted, sections={"The loop": lines}, origin=origin))
-    if talk.json:
-        talk.done(out, answer)
-        return
-    for line in lines:
-        talk.out.print(escape(line))
-    talk.out.print()
-    talk.out.print(_table(found.parameters))
-    talk.out.print("\nConditional on that law, on the held-out half of the drive:")
-    talk.out.print(*diagnosis_headline(gap), sep="\n")
-    for note in diagnosis_notes(gap):
-        talk.out.print(note)
-    names = ", ".join(p.name for p in written)
-    talk.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {names}", soft_wrap=True)
+    if not talk.json:
+        talk.lines(lines)
+        talk.line("")
+        talk.table(_table(found.parameters))
+        talk.line("Conditional on that law, on the held-out half of the drive:")
+        print_diagnosis(talk, gap, tables=False)
+    talk.done(out, answer, [p.name for p in written])
 
 
 def _table(parameters: Mapping[str, Any]) -> Table:
     from avtorch.gap.quantity import unit_of, words_of
+    from avtorch.report.table import Table
 
-    table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
-    for title in ("of the loop", "mean", "90 %"):
-        table.add_column(title, no_wrap=True)
-    for name, q in parameters.items():
-        unit = unit_of(name)
-        table.add_row(words_of(name), f"{q.mean:.2f}{'' if unit == '-' else ' ' + unit}", f"{q.q05:.2f} to {q.q95:.2f}")
-    return table
+    units = {name: "" if unit_of(name) == "-" else f" {unit_of(name)}" for name in parameters}
+    rows = tuple(
+        (words_of(name), f"{q.mean:.2f}{units[name]}", f"{q.q05:.2f} to {q.q95:.2f}") for name, q in parameters.items()
+    )
+    return Table("The loop", ("of the loop", "mean", "90 %"), rows)
+
+
+def print_diagnosis(talk: Talk, found: Diagnosis, *, tables: bool = True) -> None:
+    """The verdict in one sentence and its reason, the page's tables, and a few lines below."""
+    from avtorch.gap.result import sentences
+    from avtorch.report.diagnosis_tables import budget_table, candidate_table
+
+    odd = found.winner.implausible
+    known = {"unknown": "bold yellow", "none": "bold green"}
+    talk.lines([sentences.headline(found)], "bold yellow" if odd else known.get(found.verdict.name, "bold cyan"))
+    talk.lines(odd, "yellow")
+    talk.lines([*sentences.tested(found), *sentences.budget(found)])
+    talk.lines([found.verdict.why], "dim")
+    talk.line("")
+    if tables and found.budget is not None and found.budget.says_something:
+        talk.table(budget_table(found.budget, found.log.epochs_s[0]))
+    if tables:
+        talk.table(candidate_table(found, most=8))
+    talk.lines([sentences.aliases(found), *sentences.onset(found), *sentences.where(found), *sentences.moved(found)])
+    talk.lines([*sentences.gap(found), *sentences.shrinkage(found), *sentences.to_set(found)])
+    talk.lines([*sentences.to_drive(found), *sentences.remains(found)])
+    if not found.complete:
+        text = "The budget ended the search: the answer is provisional; give the command a larger one."
+        talk.lines([text], "yellow")
+    talk.lines([note for note in found.notes if found.complete or "budget" not in note], "dim")

@@ -31,7 +31,7 @@ def commanded(talk: Talk, drives: Sequence[Log]) -> tuple[list[Log], PedalFit | 
     with talk.waiting("Fitting a map of the commands"):
         fit = fit_pedals(drives)
         sentence = map_sentence(fit, held_out(drives))
-    talk.sentence(sentence)
+    talk.lines([sentence, ""])
     return [fit.map.commanded(drive) for drive in drives], fit, sentence
 
 

@@ -13,18 +13,18 @@ from avtorch.cli.arguments import (
     Gain,
     Json,
     Lag,
+    Open,
     Out,
     Quiet,
     Seed,
     free_folder,
     limits_pair,
     not_negative,
+    origin_of,
     positive,
     seed_number,
     whole_number,
 )
-from avtorch.cli.browser import Open, show
-from avtorch.cli.command_line import origin_of
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
@@ -133,9 +133,8 @@ def run(
     )
     _write(out, answer, acting, alone, acts=strategy != "none", vehicle=(T, K), change_at=change_at, origin=origin)
     if open_page:
-        show(out / PAGE, talk)
-    talk.windows(answer["windows"])
-    talk.story(answer)
+        talk.show(out / PAGE)
+    _print(talk, answer)
     talk.done(out, answer)
 
 
@@ -197,7 +196,7 @@ def _write(
 ) -> None:
     from avtorch import plots
     from avtorch.report import write_run_page
-    from avtorch.report.run_page import Regions
+    from avtorch.report.run import Regions
 
     time, rows = acting.rows.time, acting.rows
     traces: dict[str, dict[str, Any]] = {}
@@ -222,6 +221,18 @@ def _write(
         write_run_page(answer, time, traces, folder=staged, truth=truth, bounds=BOUNDS, regions=regions, origin=origin)
 
     write_answer(out, "run.json", answer, pictures, more=page, also=(PAGE,))
+
+
+def _print(talk: Talk, answer: dict[str, Any]) -> None:
+    """The events of a run in order, its windows, and how much the action helped."""
+    from avtorch.report.run import collision, performance_table, story_table
+    from avtorch.report.window_tables import P_WORDS, window_table
+
+    talk.table(window_table(answer["windows"]), most=60)
+    talk.lines([P_WORDS, ""], "dim")
+    talk.table(story_table(answer), most=12)
+    talk.table(performance_table(answer))
+    talk.lines(collision(answer), "bold red")
 
 
 def _moments(acting: SupervisedRun, change_at: float) -> tuple[list[tuple[str, dict[str, Any]]], dict[str, Any]]:

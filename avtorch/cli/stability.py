@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -74,8 +75,26 @@ def stability(
         )
 
     write_answer(out, "stability.json", answer, {"stability.png": picture})
-    talk.stability(answer)
+    _print(talk, answer)
     talk.done(out, answer)
+
+
+def _print(talk: Talk, answer: Mapping[str, Any]) -> None:
+    from avtorch.report.table import Table
+
+    lines = [(group, *line) for group, lines in answer["conditions"].items() for line in lines.items()]
+    rows = tuple((group, line, f"{value:.4g}", "holds" if value > 0 else "fails") for group, line, value in lines)
+    talk.table(Table("Conditions", ("condition", "expression > 0", "value", ""), rows, numeric=("value",)))
+    if answer["setting"]["dead_time_s"] > 0:
+        talk.lines(["The conditions above ignore the dead time; the verdict below includes it."], "dim")
+    for word in ("locally", "string"):
+        stable = answer[f"{word}_stable"]
+        name = f"{word} stable"
+        talk.lines([f"{name:<16} {'yes' if stable else 'no'}"], "bold green" if stable else "bold red")
+    if answer["peak_gain"] is not None:
+        where = "" if answer["string_stable"] else f" at {answer['peak_frequency_radps']:.3g} rad/s"
+        talk.lines([f"peak gain        {answer['peak_gain']:.4f}{where}"], "bold")
+    talk.lines([f"dead time left   {answer['dead_time_margin_s']:.3f} s before local instability"])
 
 
 def _around(name: str, value: float) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from cyclopts import Parameter
 from avtorch.cli.arguments import (
     Columns,
     Json,
+    Open,
     Out,
     Quiet,
     Seed,
@@ -19,14 +20,12 @@ from avtorch.cli.arguments import (
     Units,
     free_folder,
     not_negative,
+    origin_of,
     positive,
     seed_number,
     whole_number,
 )
-from avtorch.cli.browser import Open, show
-from avtorch.cli.command_line import origin_of
 from avtorch.cli.talk import Talk, write_answer
-from avtorch.cli.validation_table import validation_notes, validation_table
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
@@ -117,7 +116,7 @@ def validate(
     origin = origin_of([] if log is None else [log], **given_settings, **more)
 
     from avtorch import plots
-    from avtorch.report import write_validation_page
+    from avtorch.report.validation import validation_notes, validation_table, write_validation_page
 
     groups = found.to_arviz()
     with answer_set(out, ("validation.json", PAGE, *plots.VALIDATION_PICTURES, *EXPORTS)) as staged:
@@ -125,14 +124,12 @@ def validate(
         write_validation_page(found, staged, origin=origin)
         write_answer(staged, "validation.json", answer, plots.validation_figures(found))
     if open_page:
-        show(out / PAGE, talk)
-    talk.out.print(validation_table(answer))
-    for note in validation_notes(answer):
-        talk.out.print(note, style="dim", markup=False)
-    verdict = f"\n{answer['verdict']}: {answer['why']}"
-    talk.out.print(verdict, style="bold green" if found.verdict.agree else "bold red", markup=False)
+        talk.show(out / PAGE)
+    talk.table(validation_table(answer))
+    talk.lines(validation_notes(answer), "dim")
+    talk.lines([f"\n{answer['verdict']}: {answer['why']}"], "bold green" if found.verdict.agree else "bold red")
     talk.done(out, answer)
-    talk.out.print(f"For ArviZ: {', '.join(f'{name}.nc' for name in groups)}", markup=False)
+    talk.lines([f"For ArviZ: {', '.join(f'{name}.nc' for name in groups)}"])
 
 
 def export(out: Path, groups: Mapping[str, InferenceData]) -> None:

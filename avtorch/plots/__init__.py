@@ -19,102 +19,55 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from avtorch.plots.calibration_figures import calibration_figure
     from avtorch.plots.detectors import operating_curve, operating_figure
-    from avtorch.plots.figures import (
-        belief_figure,
-        motion_figure,
-        overview_figure,
-        probability_figure,
-        region_figure,
-        stability_figure,
-    )
+    from avtorch.plots.drive import diagnosis_figure
     from avtorch.plots.gaps import gap_figure, gap_peak, gap_probability, gap_throughput
-    from avtorch.plots.paper_figures import PAPER_PICTURES, paper_pictures
+    from avtorch.plots.paper import PAPER_PICTURES, paper_pictures
     from avtorch.plots.pedals import pedal_figure, pedal_lines
-    from avtorch.plots.plane import gain_curve, region, setting_region, verdict_legend, verdict_map
+    from avtorch.plots.plane import (
+        gain_curve,
+        region,
+        region_figure,
+        setting_region,
+        stability_figure,
+        verdict_legend,
+        verdict_map,
+    )
     from avtorch.plots.posterior_figures import VALIDATION_PICTURES, validation_figures
     from avtorch.plots.posteriors import agreement_scatter, exact_density, joint_cloud, marginals
     from avtorch.plots.ranks import ecdf_difference, ecdf_of, pooled_rank_counts, rank_band, rank_plot
     from avtorch.plots.ratios import ratio_figure, ratio_whiskers
     from avtorch.plots.signatures import effect_signature, signature_figure
     from avtorch.plots.style import STYLE, save, show
-    from avtorch.plots.time import belief_band, data_quality, events, motion, string_probability
-    from avtorch.plots.whole_drive import diagnosis_figure
+    from avtorch.plots.time import (
+        belief_band,
+        belief_figure,
+        data_quality,
+        events,
+        motion,
+        motion_figure,
+        overview_figure,
+        probability_figure,
+        string_probability,
+    )
 
 _HOME = {
-    "avtorch.plots.calibration_figures": ("calibration_figure",),
-    "avtorch.plots.detectors": (
-        "operating_curve",
-        "operating_figure",
-    ),
-    "avtorch.plots.figures": (
-        "belief_figure",
-        "motion_figure",
-        "overview_figure",
-        "probability_figure",
-        "region_figure",
-        "stability_figure",
-    ),
-    "avtorch.plots.gaps": (
-        "gap_figure",
-        "gap_peak",
-        "gap_probability",
-        "gap_throughput",
-    ),
-    "avtorch.plots.paper_figures": (
-        "PAPER_PICTURES",
-        "paper_pictures",
-    ),
-    "avtorch.plots.pedals": (
-        "pedal_figure",
-        "pedal_lines",
-    ),
-    "avtorch.plots.plane": (
-        "gain_curve",
-        "region",
-        "setting_region",
-        "verdict_legend",
-        "verdict_map",
-    ),
-    "avtorch.plots.posterior_figures": (
-        "VALIDATION_PICTURES",
-        "validation_figures",
-    ),
-    "avtorch.plots.posteriors": (
-        "agreement_scatter",
-        "exact_density",
-        "joint_cloud",
-        "marginals",
-    ),
-    "avtorch.plots.ranks": (
-        "ecdf_difference",
-        "ecdf_of",
-        "pooled_rank_counts",
-        "rank_band",
-        "rank_plot",
-    ),
-    "avtorch.plots.ratios": (
-        "ratio_figure",
-        "ratio_whiskers",
-    ),
-    "avtorch.plots.signatures": (
-        "effect_signature",
-        "signature_figure",
-    ),
-    "avtorch.plots.style": (
-        "STYLE",
-        "save",
-        "show",
-    ),
-    "avtorch.plots.time": (
-        "belief_band",
-        "data_quality",
-        "events",
-        "motion",
-        "string_probability",
-    ),
-    "avtorch.plots.whole_drive": ("diagnosis_figure",),
+    "calibration_figures": "calibration_figure",
+    "detectors": "operating_curve operating_figure",
+    "drive": "diagnosis_figure",
+    "gaps": "gap_figure gap_peak gap_probability gap_throughput",
+    "paper": "PAPER_PICTURES paper_pictures",
+    "pedals": "pedal_figure pedal_lines",
+    "plane": "gain_curve region region_figure setting_region stability_figure verdict_legend verdict_map",
+    "posterior_figures": "VALIDATION_PICTURES validation_figures",
+    "posteriors": "agreement_scatter exact_density joint_cloud marginals",
+    "ranks": "ecdf_difference ecdf_of pooled_rank_counts rank_band rank_plot",
+    "ratios": "ratio_figure ratio_whiskers",
+    "signatures": "effect_signature signature_figure",
+    "style": "STYLE save show",
+    "time": "belief_band belief_figure data_quality events motion motion_figure overview_figure "
+    "probability_figure string_probability",
 }
-_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+_MODULE_OF = {name: f"avtorch.plots.{home}" for home, names in _HOME.items() for name in names.split()}
 
 __all__ = [
     "PAPER_PICTURES",

@@ -13,16 +13,28 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from avtorch.arrays import FloatArray, IntArray
+from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.answer.budget import HORIZON_S, LIKELY, Budget, percent
 from avtorch.gap.answer.location import UNITS, Axis
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Candidate, Diagnosis
 from avtorch.io.clock import time_label
-from avtorch.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILLION, styled
-from avtorch.vehicle.stability import Chain, chain_gain
+from avtorch.plots.style import (
+    BLACK,
+    BLUE,
+    GREY,
+    NARROW,
+    ORANGE,
+    SKY,
+    VERMILLION,
+    WIDE,
+    legend,
+    panels_of,
+    styled,
+)
 
+_CELLS = 24  # a side of the force map
 _SECONDS = 25.0  # seconds of a drive in a picture
 _NAMES = {"accel": "acceleration [m/s²]", "speed": "speed [m/s]"}
 
@@ -63,11 +75,6 @@ def _bars_of(budget: Budget) -> list[tuple[str, Quantity, str]]:
     rest = budget.left_above_noise
     both = (("unexplained", rest, ORANGE if budget.unexplained.material else SKY), ("noise", 1.0 - rest, GREY))
     return [(name, Quantity(share, 0.0, share, share), colour) for name, share, colour in both]
-
-
-def budget_bar_count(budget: Budget) -> int:
-    """Bars that `budget_bars` draws."""
-    return len(_bars_of(budget))
 
 
 _UP_TO_ONE = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -286,26 +293,10 @@ def shrinkage(ax: Axes, found: Diagnosis, channel: str) -> Axes:
     return ax
 
 
-def loop_gain(ax: Axes, chains: Mapping[str, tuple[Chain, dict]], *, colours: Mapping[str, str] | None = None) -> Axes:
-    """|V / V_lead| over frequency [Hz] with the band of 90 % of the draws, by label: a chain and its setting.
-
-    A setting is the keyword arguments of `avtorch.vehicle.stability.chain_gain`. Above 1 a disturbance grows from car
-    to car.
-    """
-    given = dict(colours or {})
-    palette = iter((VERMILLION, BLUE, GREY, ORANGE))
-    for label, (chain, setting) in chains.items():
-        gain = chain_gain(chain, **setting).reshape(-1, len(chain.omega)).numpy()
-        f = chain.omega.numpy() / (2 * np.pi)
-        colour = given.get(label) or next(palette)
-        low, middle, high = np.quantile(gain, (0.05, 0.5, 0.95), axis=0)
-        ax.plot(f, middle, color=colour, label=label)
-        if len(gain) > 1:
-            ax.fill_between(f, low, high, color=colour, alpha=0.18, lw=0)
-    ax.axhline(1.0, color=BLACK, lw=0.8)
-    ax.set(xscale="log", xlim=(0.005, 2.0), xlabel="frequency [Hz]", ylabel="speed, follower / leader")
-    ax.set_ylim(0, min(max(1.3, ax.get_ylim()[1]), 4.0))
-    return ax
+def _bars_figure(rows: int, narrow: bool) -> Figure:
+    """For so many bars."""
+    size = (NARROW, 0.9 + 0.5 * rows) if narrow else (WIDE, 0.9 + 0.36 * rows)
+    return Figure(figsize=size, layout="constrained")
 
 
 @styled
@@ -313,7 +304,7 @@ def budget_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     """The budget of the gap. Raises `InputError` where the diagnosis has none."""
     if found.budget is None:
         raise InputError("budget: the diagnosis has none to draw; its drives are too short to hold out blocks")
-    figure = _bars_figure(budget_bar_count(found.budget), narrow)
+    figure = _bars_figure(len(_bars_of(found.budget)), narrow)
     budget_bars(figure.add_subplot(), found.budget, narrow=narrow)
     return figure
 
@@ -321,9 +312,8 @@ def budget_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
 @styled
 def road_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     """The picture of the gap over time."""
-    figure = Figure(figsize=(_NARROW, 3.6) if narrow else (_WIDE, 3.3), layout="constrained")
-    ax = gap_on_the_road(figure.add_subplot(), found)
-    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper left", ncols=1 if narrow else 3)
+    figure, (ax,) = panels_of(1, 3.3, narrow=narrow)
+    legend(figure, [gap_on_the_road(ax, found)], narrow=narrow)
     return figure
 
 
@@ -333,12 +323,12 @@ def where_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     axes: list[Axis] = ["time", "command"]
     if found.traces is not None and found.traces.speed is not None:
         axes.insert(1, "speed")
-    figure, panels = _panels(len(axes), 2.6, narrow)
+    figure, panels = panels_of(len(axes), 2.6, narrow=narrow)
     for i, (ax, axis) in enumerate(zip(panels, axes, strict=True)):
         where_it_lies(ax, found, axis)
         if i and not narrow:
             ax.set_ylabel("")
-    _shared_legend(figure, panels, narrow)
+    legend(figure, panels, narrow=narrow)
     return figure
 
 
@@ -355,34 +345,77 @@ def shrinkage_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     """How far the gap shrinks, a panel per channel."""
     scores = found.shrinkage
     names = [] if scores is None else [w for w in ("accel", "speed") if f"rollout_rmse_{w}" in scores.by_metric]
-    figure, panels = _panels(len(names), 3.2, narrow)
+    figure, panels = panels_of(len(names), 3.2, narrow=narrow)
     for ax, channel in zip(panels, names, strict=True):
         shrinkage(ax, found, channel)
-    _shared_legend(figure, panels, narrow)
+    legend(figure, panels, narrow=narrow)
     return figure
 
 
-_WIDE, _NARROW = 8.6, 4.0
-"""Widths [in]: on a desk, and on a phone, where the letters stay as large."""
+def force_contours(ax: Axes, found: Diagnosis) -> Axes:
+    """Force beyond K u [m/s²] of the force map over speed and command; hatched, what was not driven: there only its
+    smoothness speaks, and far from the drive it goes back to K u. Raises `InputError` without a force map."""
+    form = found.free_form
+    if form is None or not form.sizes.table > 0:
+        raise InputError("free_form: the repaired simulator has no force map to draw")
+    u, v, table = form.knots_u, form.knots_v, form.at.table
+    most = max(float(np.abs(table).max()), 1e-6)
+    drawn = ax.contourf(v, u, table, levels=np.linspace(-most, most, 13), cmap="RdBu_r")
+    ax.figure.colorbar(drawn, ax=ax, label="force beyond K u [m/s²]", format="%.2g")
+    across, along, driven = driven_cells(found)
+    # contourf takes values in the middle of cells
+    middle = [0.5 * (x[1:] + x[:-1]) for x in (across, along)]
+    ax.contourf(*middle, (~driven).T.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
+    ax.axhline(0.0, color=GREY, lw=0.8)
+    ax.set(xlabel="speed [m/s]", ylabel="command [m/s²]", xlim=(v[0], v[-1]), ylim=(u[0], u[-1]))
+    ax.grid(visible=False)
+    return ax
 
 
-def _bars_figure(rows: int, narrow: bool) -> Figure:
-    """For so many bars."""
-    return Figure(figsize=(_NARROW, 0.9 + 0.5 * rows) if narrow else (_WIDE, 0.9 + 0.36 * rows), layout="constrained")
+def resistance_line(ax: Axes, found: Diagnosis) -> Axes:
+    """The resistance of the free form [m/s²] over speed, and where the middle nine tenths of the drive lie.
+
+    Raises `InputError` without a resistance.
+    """
+    form = found.free_form
+    if form is None or not form.sizes.resistance > 0:
+        raise InputError("free_form: the repaired simulator has no resistance to draw")
+    ax.plot(form.knots_v, form.at.curve, color=BLUE, marker=".")
+    speed = None if found.traces is None else found.traces.speed
+    if speed is not None:
+        low, high = np.quantile(speed, (0.05, 0.95))
+        ax.axvspan(float(low), float(high), color=GREY, alpha=0.15, lw=0)
+    ax.axhline(0.0, color=BLACK, lw=0.8)
+    ax.set(xlabel="speed [m/s]", ylabel="acceleration [m/s²]")
+    return ax
 
 
-def _panels(count: int, height: float, narrow: bool) -> tuple[Figure, list[Axes]]:
-    """Panels of that height [in] side by side, or in a `narrow` figure one above the other."""
-    if narrow:
-        figure = Figure(figsize=(_NARROW, 0.6 + 0.8 * height * count), layout="constrained")
-        return figure, [figure.add_subplot(count, 1, i + 1) for i in range(count)]
-    figure = Figure(figsize=(_WIDE, height), layout="constrained")
-    return figure, [figure.add_subplot(1, count, i + 1) for i in range(count)]
+def driven_cells(found: Diagnosis) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Edges of cells in speed [m/s] and command [m/s²], and whether the drive was in each (speed, command)."""
+    form, traces = found.free_form, found.traces
+    assert form is not None
+    edges = [np.linspace(x[0], x[-1], _CELLS + 1) for x in (form.knots_v, form.knots_u)]
+    if traces is None or traces.speed is None:
+        return edges[0], edges[1], np.ones((_CELLS, _CELLS), bool)
+    counts = np.histogram2d(traces.speed, traces.command, bins=edges)[0]
+    return edges[0], edges[1], counts > 0
 
 
-def _shared_legend(figure: Figure, panels: Sequence[Axes], narrow: bool) -> None:
-    """One legend above all panels, each label once."""
-    handles = {label: handle for ax in panels for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(
-        list(handles.values()), list(handles), loc="outside upper left", ncols=2 if narrow else max(1, len(handles))
-    )
+@styled
+def free_form_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
+    """What the repaired simulator carries without a name, a panel for the map and one for the resistance.
+
+    Raises `InputError` where it carries nothing.
+    """
+    form = found.free_form
+    if form is None:
+        raise InputError("free_form: the repaired simulator carries nothing without a name")
+    panels = [
+        draw
+        for draw, size in ((force_contours, form.sizes.table), (resistance_line, form.sizes.resistance))
+        if size > 0
+    ]
+    figure, axes = panels_of(len(panels), 3.3, narrow=narrow, wide=4.3 * len(panels))
+    for ax, draw in zip(axes, panels, strict=True):
+        draw(ax, found)
+    return figure

@@ -1,4 +1,4 @@
-"""Drawings over parameters and frequency: regions, clouds of belief, gain curves. Each takes an axes and returns it."""
+"""Drawings over parameters and frequency, and figures made of them: regions, clouds of belief, gain curves."""
 
 from __future__ import annotations
 
@@ -9,12 +9,26 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.contour import ContourSet
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from avtorch.plots.style import AMPLIFIES, BLACK, BLUE, GREY, LABELS, ORANGE, PURPLE, STABLE, UNSTABLE, VERMILLION
+from avtorch.plots.style import (
+    AMPLIFIES,
+    BLACK,
+    BLUE,
+    GREY,
+    LABELS,
+    NARROW,
+    ORANGE,
+    PURPLE,
+    STABLE,
+    UNSTABLE,
+    VERMILLION,
+    styled,
+)
 from avtorch.vehicle import LowerLevel, stability
 
 _VERDICT = ("_unstable", "_amplifies", "_string stable")
@@ -220,3 +234,93 @@ def verdict_legend(ax: Axes, *, extra: bool = True, beside: Sequence[Axes] = ())
                 patches.append(proxy)
     ax.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=8.5)
     return ax
+
+
+# figures -------------------------------------------------------------------------------------------------------------
+@styled
+def region_figure(
+    settings: Sequence[tuple[str, Mapping[str, Any]]],
+    clouds: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    *,
+    truth: tuple[float, float] | None = None,
+    narrow: bool = False,
+    points: int = 401,
+) -> Figure:
+    """The posterior cloud in the stability region of each named setting, side by side on the same axes.
+
+    `clouds`: draws of T_L [s] and K_L [-], (draw,) each, by name; `truth`: the two of the true vehicle; `points` of
+    the map on each axis.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch import Setting
+        >>> from avtorch.plots import region_figure
+        >>> settings = [(f"{gap} s", Setting(time_gap=gap).as_dict()) for gap in (1.0, 2.5)]
+        >>> T_L, K_L = np.random.default_rng(0).normal([[1.5], [0.5]], 0.02, (2, 100))
+        >>> len(region_figure(settings, {"now": (T_L, K_L)}, truth=(1.5, 0.5)).axes)
+        2
+    """
+    t = np.concatenate([np.asarray(c[0]) for c in clouds.values()] + [[] if truth is None else [truth[0]]])
+    k = np.concatenate([np.asarray(c[1]) for c in clouds.values()] + [[] if truth is None else [truth[1]]])
+    # a few far draws of a broad belief must not squeeze the rest into a corner
+    T_range = (0.02, max(1.0, 1.25 * float(np.quantile(t, 0.99)), 1.25 * (truth[0] if truth else 0.0)))
+    K_range = (min(0.25, 0.8 * float(np.quantile(k, 0.01))), max(1.3, 1.15 * float(np.quantile(k, 0.99))))
+    count = len(settings)
+    size = (NARROW, 3.9 * count + 0.8) if narrow else (4.9 * count + 0.4, 5.2)
+    figure = Figure(figsize=size, layout="constrained")
+    shape = (count, 1) if narrow else (1, count)
+    axes = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False).ravel()
+    for ax, (title, setting) in zip(axes, settings, strict=True):
+        setting_region(ax, setting, T_range=T_range, K_range=K_range, clouds=clouds, truth=truth, points=points)
+        ax.set_title(title)
+        ax.label_outer()
+    legend = verdict_legend(axes[0], beside=list(axes[1:])).get_legend()
+    assert legend is not None
+    handles = legend.legend_handles
+    legend.remove()
+    figure.legend(
+        handles=[h for h in handles if h is not None],
+        loc="outside lower center",
+        ncols=1 if narrow else 3,
+        fontsize=8.5,
+    )
+    return figure
+
+
+@styled
+def stability_figure(
+    plane: stability.Region,
+    point: tuple[float, float],
+    omega: ArrayLike,
+    gain: ArrayLike,
+    *,
+    peak: tuple[float, float] | None = None,
+    stable: bool = True,
+    title: str = "",
+) -> Figure:
+    """A stability region with one setting in it, beside that setting's gain over frequency.
+
+    `omega` [rad/s] and `gain` [-] are (frequency,), `peak` the two at the peak. `stable`: the setting is
+    locally stable; where it is not, the gain is only formal, and the picture is labelled so.
+
+    Example:
+        >>> import torch
+        >>> from avtorch import stability
+        >>> from avtorch.plots import stability_figure
+        >>> plane = stability.region(("T", torch.linspace(0.1, 2, 21)), ("K", torch.linspace(0.2, 1.3, 11)))
+        >>> omega = torch.logspace(-1, 1, 50)
+        >>> size = stability.gain(omega, 1.5, 0.5, 1.0, (1.5, 1.5, -0.8))
+        >>> len(stability_figure(plane, (1.5, 0.5), omega, size).axes)
+        2
+    """
+    figure = Figure(figsize=(10.4, 4.8), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[1, 1.05])
+    verdict_legend(region(left, plane, point=point), extra=False)
+    gain_curve(right, omega, gain, peak=peak)
+    left.set_title("Region")
+    right.set_title("Leader's speed to follower's")
+    if not stable:
+        right.text(0.02, 0.97, "locally unstable: formal only", transform=right.transAxes, va="top", color=VERMILLION)
+    if title:
+        figure.suptitle(title, fontsize=10, color=GREY)
+    return figure

@@ -9,13 +9,14 @@ from __future__ import annotations
 import io
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import Any, ParamSpec
 
 import matplotlib as mpl
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, FigureBase
 
 from avtorch.display.notebook import notebook_display
 from avtorch.io import atomic
@@ -90,6 +91,39 @@ SHORT = {
 
 P = ParamSpec("P")
 
+WIDE, NARROW = 8.6, 4.0
+"""Widths of a page's figures [in]: on a desk, and on a phone, where the letters stay as large."""
+
+
+def panels_of(count: int, height: float, *, narrow: bool = False, wide: float = WIDE) -> tuple[Figure, list[Axes]]:
+    """Panels of that height [in] side by side, or in a `narrow` figure one above the other."""
+    if narrow:
+        figure = Figure(figsize=(NARROW, 0.6 + (0.8 if count > 1 else 0.9) * height * count), layout="constrained")
+        return figure, list(figure.subplots(count, 1, squeeze=False)[:, 0])
+    figure = Figure(figsize=(wide, height), layout="constrained")
+    return figure, list(figure.subplots(1, count, squeeze=False)[0])
+
+
+def legend(
+    figure: FigureBase,
+    panels: Iterable[Axes],
+    *,
+    where: str = "upper left",
+    narrow: bool = False,
+    columns: int = 6,
+    last: Sequence[str] = (),
+    **look: Any,
+) -> None:
+    """One legend for all panels outside of them, each label once, those of `last` behind the others."""
+    handles: dict[str, Any] = {}
+    for ax in panels:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    names = sorted(handles, key=lambda name: last.index(name) + 1 if name in last else 0)
+    count = max(1, min(2 if narrow else columns, len(names)))
+    place: Any = f"outside {where}"
+    figure.legend([handles[name] for name in names], names, loc=place, ncols=count, **look)
+
 
 def short(name: str) -> str:
     """A quantity's name for a heading, without its unit."""
@@ -110,11 +144,12 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Write a figure as PNG, whole or not at all.
 
-    Example:
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.plots import save
-        >>> save(Figure(figsize=(1, 1)), "empty.png").read_bytes()[1:4]
-        b'PNG'
+        Example:
+            >>> from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, FigureBase
+            >>> from avtorch.plots import save
+            >>> save(Figure(figsize=(1, 1)), "empty.png").read_bytes()[1:4]
+            b'PNG'
     """
     picture = _png(figure)
     with atomic(path, binary=True) as stream:
@@ -125,13 +160,14 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
 def show(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Display a figure below the cell in a notebook; elsewhere save it at `path` and print the path.
 
-    Raises `InputError` where the file cannot be written.
+        Raises `InputError` where the file cannot be written.
 
-    Example:
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.plots import show
-        >>> show(Figure(figsize=(1, 1)), "empty.png")  # in a notebook the picture itself
-        picture: empty.png
+        Example:
+            >>> from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, FigureBase
+            >>> from avtorch.plots import show
+            >>> show(Figure(figsize=(1, 1)), "empty.png")  # in a notebook the picture itself
+            picture: empty.png
     """
     display = notebook_display()
     if display is None:

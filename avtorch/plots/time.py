@@ -1,18 +1,23 @@
-"""Drawings over time: motion, beliefs, events, the quality of a log. Each takes an axes and returns it."""
+"""Drawings over time, and figures made of them: motion, beliefs, events, the quality of a log.
+
+Figures are as wide as a desk's page; with `narrow` as a phone.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from avtorch.deprecation import renamed
 from avtorch.io import Log
-from avtorch.io.clock import from_start
-from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, LABELS, ORANGE, SKY, VERMILLION
+from avtorch.io.clock import from_start, time_label
+from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, LABELS, NARROW, ORANGE, SKY, VERMILLION, legend, styled
 
 _TRACES = {
     "leader": {"color": GREY, "linewidth": 1.2, "zorder": 2.1},
@@ -25,6 +30,13 @@ Windows = Sequence[Mapping[str, Any]]
 
 Steps = Sequence[tuple[float, float]]
 """A quantity that jumps: `(from this time on [s], value)`."""
+
+
+Motion = Mapping[str, Mapping[str, ArrayLike]]
+"""Traces of a run: `{"speed": {"leader": ..., "without action": ..., "with action": ...}, "accel": {...}, ...}`."""
+
+_WIDE = 9.0  # inches
+_ABOVE: Any = {"where": "upper center", "columns": 4, "last": ("vehicle changes", "alert", "action")}
 
 
 def motion(ax: Axes, time: ArrayLike, traces: Mapping[str, ArrayLike], *, quantity: str = "speed") -> Axes:
@@ -235,3 +247,156 @@ def _span(ax: Axes, ends: np.ndarray) -> Axes:
     if ends[1] > ends[0]:
         ax.set_xlim(float(ends[0]), float(ends[1]))
     return ax
+
+
+# figures -------------------------------------------------------------------------------------------------------------
+@styled
+def motion_figure(answer: Mapping[str, Any], time: ArrayLike, traces: Motion, *, narrow: bool = False) -> Figure:
+    """Speeds [m/s], accelerations [m/s²] and spacings [m] of a run with and without action, over `time` (time,) [s].
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.plots import motion_figure
+        >>> time = np.arange(0.0, 10.0, 0.1)
+        >>> traces = {q: {"leader": np.sin(time), "with action": np.sin(time - 1)} for q in ("speed", "accel")}
+        >>> len(motion_figure({"change": {"time_s": 4.0}}, time, traces).axes)
+        2
+    """
+    figure = Figure(figsize=(NARROW if narrow else _WIDE, 2.3 * len(traces) + 0.6), layout="constrained")
+    axes = figure.subplots(len(traces), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, (quantity, named) in zip(axes, traces.items(), strict=True):
+        motion(_events_of(ax, answer), time, named, quantity=quantity)
+    axes[-1].set_xlabel("time [s]")
+    legend(figure, [axes[0]], narrow=narrow, **_ABOVE)
+    return figure
+
+
+@styled
+def belief_figure(
+    windows: Windows,
+    *,
+    answer: Mapping[str, Any] | None = None,
+    truth: Mapping[str, Steps] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    log: Log | None = None,
+    narrow: bool = False,
+) -> Figure:
+    """Posterior bands of T_L and K_L over time; with a `log`, the quality of its rows below them.
+
+    Times are drawn from the log's start, given by the answer's `epoch_s` or the `log`.
+
+    Example:
+        >>> from avtorch import Leader, estimate, simulate
+        >>> from avtorch.plots import belief_figure
+        >>> from avtorch.results import estimates_answer
+        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
+        >>> answer = estimates_answer(estimate(log, estimator="map"))
+        >>> len(belief_figure(answer["windows"], log=log).axes)  # T_L, K_L, quality of the rows
+        3
+    """
+    epoch_s = log.epoch_s if log is not None else (answer or {}).get("epoch_s", 0.0)
+    recorded, windows, answer = windows, from_start(windows, epoch_s), _from_start(answer, epoch_s)
+    rows = 2 + (log is not None)
+    figure = Figure(figsize=(NARROW if narrow else _WIDE, 5.8 if log is None else 6.8), layout="constrained")
+    heights = [3, 3, 1.3][:rows]
+    axes = figure.subplots(rows, 1, sharex=True, height_ratios=heights)
+    for ax, name in zip(axes, ("T_L", "K_L"), strict=False):
+        _events_of(ax, answer or {})
+        belief_band(ax, windows, name, truth=(truth or {}).get(name), bounds=(bounds or {}).get(name))
+    if log is not None:
+        data_quality(axes[-1], log, recorded)
+    axes[-1].set_xlabel(time_label(epoch_s))
+    legend(figure, axes[:2], narrow=narrow, **_ABOVE)
+    return figure
+
+
+@renamed(until="0.3", target="required")
+@styled
+def probability_figure(
+    windows: Windows, *, answer: Mapping[str, Any] | None = None, required: float = 0.95, narrow: bool = False
+) -> Figure:
+    """P(string stable) over time, with alerts and actions; each action is labelled with the setting it chose.
+
+    Example:
+        >>> from avtorch import Leader, estimate, simulate
+        >>> from avtorch.plots import probability_figure
+        >>> from avtorch.results import estimates_answer
+        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
+        >>> answer = estimates_answer(estimate(log, estimator="map"))
+        >>> len(probability_figure(answer["windows"]).axes)
+        1
+    """
+    epoch_s = (answer or {}).get("epoch_s", 0.0)
+    windows, answer = from_start(windows, epoch_s), _from_start(answer, epoch_s)
+    figure = Figure(figsize=(NARROW if narrow else _WIDE, 3.6), layout="constrained")
+    ax = figure.subplots()
+    string_probability(
+        _events_of(ax, answer or {}), windows, required=required, actions=(answer or {}).get("actions") or ()
+    )
+    for i, action in enumerate((answer or {}).get("actions") or []):
+        names = " + ".join(str(s) for s in action["strategies"]) or "none"
+        ax.annotate(f"strategy {names}", (action["time_s"], 0.04 + 0.09 * (i % 4)), (4, 0), textcoords="offset points",
+                    color=GREEN, fontsize=9)  # fmt: skip
+    ax.set_xlabel(time_label(epoch_s))
+    legend(figure, [ax], narrow=narrow, **_ABOVE)
+    return figure
+
+
+@renamed(until="0.3", target="required")
+@styled
+def overview_figure(
+    answer: Mapping[str, Any],
+    time: ArrayLike,
+    traces: Motion,
+    *,
+    truth: Mapping[str, Steps] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    required: float = 0.95,
+    narrow: bool = False,
+) -> Figure:
+    """A run at one glance: acceleration, belief about lag and gain, P(string stable).
+
+    `answer` is `run.json`, or `avtorch.results.run_answer` of a `SupervisedRun` and the same drive without action;
+    `time` [s] (time,) and `traces` of `motion`. `truth`: by name, (from [s], value) pairs; `bounds`: design bounds.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch import Leader, estimate, simulate
+        >>> from avtorch.plots import overview_figure
+        >>> from avtorch.results import estimates_answer
+        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
+        >>> answer = {**estimates_answer(estimate(log, estimator="map")), "alerts": [], "actions": []}
+        >>> traces = {"accel": {"leader": log.lead_accel, "with action": log.accel}}
+        >>> len(overview_figure(answer, log.elapsed, traces).axes)
+        4
+    """
+    figure = Figure(figsize=(NARROW if narrow else _WIDE, 8.4), layout="constrained")
+    axes = figure.subplots(4, 1, sharex=True)
+    for ax in axes:
+        _events_of(ax, answer)
+    motion(axes[0], time, traces["accel"], quantity="accel")
+    for ax, name in zip(axes[1:3], ("T_L", "K_L"), strict=True):
+        belief_band(ax, answer["windows"], name, truth=(truth or {}).get(name), bounds=(bounds or {}).get(name))
+    string_probability(axes[3], answer["windows"], required=required, actions=answer["actions"])
+    axes[3].set_xlabel("time [s]")
+    legend(figure, axes, narrow=narrow, **_ABOVE)
+    return figure
+
+
+def _from_start(answer: Mapping[str, Any] | None, epoch_s: float) -> dict[str, Any]:
+    """An answer with the times of windows, alerts and actions from the log's start."""
+    lists = ("windows", "alerts", "actions")
+    return {k: from_start(v, epoch_s) if k in lists and v else v for k, v in (answer or {}).items()}
+
+
+def _events_of(ax: Axes, answer: Mapping[str, Any]) -> Axes:
+    """Mark an answer's events. Of an alarm that continues over many windows, mark only the first and those acted
+    upon."""
+    windows = answer.get("windows") or []
+    went_on = {(b["end_s"], name) for a, b in pairwise(windows) for name in set(a["alerts"]) & set(b["alerts"])}
+    answered = {a["time_s"] for a in answer.get("actions") or ()}
+    alerts = [
+        a for a in answer.get("alerts") or () if a["time_s"] in answered or (a["time_s"], a["detector"]) not in went_on
+    ]
+    change = (answer.get("change") or {}).get("time_s")
+    return events(ax, change_s=change, alerts=alerts, actions=answer.get("actions") or ())

@@ -9,13 +9,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from avtorch.report.comparison_page import comparison_html, write_comparison_page
-    from avtorch.report.estimates_page import estimates_html, write_estimates_page
-    from avtorch.report.fleet_page import fleet_html, write_fleet_page
+    from avtorch.report.comparison import comparison_html, write_comparison_page
+    from avtorch.report.diagnosis import report_html, write_report
+    from avtorch.report.estimates import estimates_html, write_estimates_page
+    from avtorch.report.fleet import fleet_html, write_fleet_page
     from avtorch.report.origin import Origin
-    from avtorch.report.page import report_html, write_report
-    from avtorch.report.run_page import run_html, write_run_page
-    from avtorch.report.validation_page import validation_html, write_validation_page
+    from avtorch.report.run import run_html, write_run_page
+    from avtorch.report.validation import validation_html, write_validation_page
 
 __all__ = [
     "Origin",
@@ -33,8 +33,8 @@ __all__ = [
     "write_validation_page",
 ]
 
-_HOME = {"Origin": "origin", "report_html": "page", "write_report": "page"} | {
-    name: f"{kind}_page"
+_HOME = {"Origin": "origin", "report_html": "diagnosis", "write_report": "diagnosis"} | {
+    name: kind
     for kind in ("comparison", "estimates", "fleet", "run", "validation")
     for name in (f"{kind}_html", f"write_{kind}_page")
 }

@@ -1,111 +1,207 @@
-"""A self-contained page: text, tables and pictures of a diagnosis. It loads nothing, and all text from the log is
-escaped."""
+"""The frame of every page: what was found first, then its sections of text, pictures and tables.
+
+A page loads nothing, and all text in it is escaped. Pictures are SVG that takes its colours from the page's style, so
+that one serves light, dark and paper.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import base64
+import hashlib
+import io
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.resources import files
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
-from avtorch.experiment import Experiment
-from avtorch.gap.result import sentences
-from avtorch.gap.result.diagnosis import Diagnosis
+from jinja2 import Environment, FunctionLoader, StrictUndefined
+from markupsafe import Markup
+
+from avtorch.errors import printable
 from avtorch.io import atomic
-from avtorch.report.entries import measure_table, percent, place_table, setting_table
-from avtorch.report.house import page_of
-from avtorch.report.manoeuvre_pictures import manoeuvre_pictures
-from avtorch.report.origin import Origin
-from avtorch.report.pictures import pictures
-from avtorch.report.residual_section import residual_section
+from avtorch.report.origin import Origin, versions
+from avtorch.report.table import Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Tone = Literal["blue", "green", "amber"]
+
+_COLOURS = {
+    "#222222": "ink",
+    "#000000": "ink",
+    "#ffffff": "paper",
+    "#0072b2": "p-blue",
+    "#d55e00": "p-vermillion",
+    "#e69f00": "p-orange",
+    "#56b4e9": "p-sky",
+    "#7f7f7f": "p-grey",
+    "#009e73": "p-green",
+    "#a6407e": "p-purple",
+    "#d3e8f2": "p-stable",
+    "#fbe6c4": "p-amplifies",
+    "#ddd3d8": "p-unstable",
+    "#b07a1e": "p-contour",
+    "#dcdcdc": "p-fill",
+    "#bbbbbb": "p-bar",
+    "#dddddd": "p-fill",
+    "#d5d5d5": "p-fill",  # a band of ranks
+    "#dadada": "p-fill",  # an exact density
+    "#555555": "soft",  # its outline
+    "#e6e6e6": "p-grid",
+}
+"""The style's name for each colour of `avtorch.plots.style`."""
+_PX_A_POINT = 1.5
 
 
-def report_html(
-    found: Diagnosis,
-    *,
-    quality: Iterable[str] = (),
-    experiment: Experiment | None = None,
-    sections: Mapping[str, Sequence[str]] | None = None,
-    origin: Origin | None = None,
-) -> str:
-    """The page as text.
+@dataclass(frozen=True)
+class Picture:
+    """A picture as `wide` and `narrow` SVG, for a desk and for a phone; `narrow` is empty where one serves both.
 
-    `quality`: notes from reading the data, one line each. `experiment`: what to drive next, for its picture.
-    `sections`: further lines after the verdict, by title. `origin`: how the answer was made, for the footer.
-
-    Example:
-        >>> from avtorch import Leader, diagnose, simulate
-        >>> from avtorch.gap import DeadTime, plant
-        >>> from avtorch.report import report_html
-        >>> late = plant([DeadTime(0.4)], sigma=0.0)
-        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
-        >>> page = report_html(diagnose(log, effects=["dead_time"], pairs=False))
-        >>> "dead_time" in page, page.rstrip().endswith("</html>")
-        (True, True)
+    `says`: what it shows, in words; `caption`; `tables`: its numbers, shown at once where `opened`.
     """
-    return page_of(
-        "diagnosis.html",
-        origin=origin,
-        found=found,
-        log=found.log,
-        headline=sentences.headline(found),
-        odd=found.winner.implausible,
-        lead=[
-            *sentences.tested(found),
-            *sentences.budget(found),
-            found.verdict.why,
-            sentences.aliases(found),
-            *sentences.onset(found),
-        ],
-        tone="amber"
-        if found.winner.implausible
-        else {"unknown": "amber", "none": "green"}.get(found.verdict.name, "blue"),
-        where=sentences.where(found),
-        places=place_table(found),
-        gap=[*sentences.gap(found), *sentences.moved(found), *sentences.remains(found)],
-        shrinkage=sentences.shrinkage(found),
-        measures=None if found.shrinkage is None else measure_table(found.shrinkage),
-        placebo=_placebo(found),
-        setting=setting_table(found),
-        sections=dict(sections or {}),
-        next_experiment=sentences.to_drive(found),
-        notes=list(found.notes),
-        quality=list(quality),
-        pictures=pictures(found, experiment),
-        left=residual_section(found),
-        each_manoeuvre=manoeuvre_pictures(found),
-    )
+
+    wide: Markup
+    narrow: Markup
+    says: str
+    caption: str = ""
+    tables: tuple[Table, ...] = ()
+    opened: bool = False
 
 
-def write_report(
-    found: Diagnosis,
-    folder: str | PathLike[str],
-    *,
-    quality: Iterable[str] = (),
-    experiment: Experiment | None = None,
-    sections: Mapping[str, Sequence[str]] | None = None,
-    origin: Origin | None = None,
-) -> Path:
-    """Write `report.html` into `folder`; returns its path. Raises `InputError` where it cannot be written.
+@dataclass(frozen=True)
+class Section:
+    """Lines, pictures, `small` pictures side by side, tables, `soft` lines, a list and `more` under a title."""
 
-    Example:
-        >>> from avtorch import Leader, diagnose, simulate
-        >>> from avtorch.gap import DeadTime, plant
-        >>> from avtorch.report import write_report
-        >>> late = plant([DeadTime(0.4)], sigma=0.0)
-        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
-        >>> write_report(diagnose(log, effects=["dead_time"], pairs=False), "out").name
-        'report.html'
-    """
-    path = Path(folder) / "report.html"
-    text = report_html(found, quality=quality, experiment=experiment, sections=sections, origin=origin)
+    title: str
+    lines: tuple[str, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    small: tuple[Picture, ...] = ()
+    tables: tuple[Table, ...] = ()
+    soft: tuple[str, ...] = ()
+    items: tuple[str, ...] = ()
+    more: str = ""
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is nothing under the title."""
+        return self == Section(self.title)
+
+
+@dataclass(frozen=True)
+class Page:
+    """`kind` of answer, and what it is `of`; `lead`: the first section, whose title is the answer; `tone`: green where
+    all is well, amber where something is to be done. `script`: of its own."""
+
+    kind: str
+    of: str
+    lead: Section
+    sections: tuple[Section, ...]
+    tone: Tone = "blue"
+    script: str = ""
+
+    def html(self, origin: Origin | None = None) -> str:
+        """The page as text; sections with nothing in them are left out."""
+        page = replace(self, sections=tuple(section for section in self.sections if not section.empty))
+        script = Markup("\n" + self.script) if self.script else ""
+        # thousands of dots are an image within the page
+        pictures = [picture for section in (page.lead, *page.sections) for picture in section.pictures]
+        policy = "; img-src data:" if any("<image" in picture.wide for picture in pictures) else ""
+        policy += f"; script-src 'sha256-{_digest(script)}'" if script else ""
+        frame = {"style": Markup(text_of("style.css")), "origin": origin or Origin(), "versions": versions()}
+        return _template("page.html").render(page=page, policy=Markup(policy), script=script, **frame)
+
+
+def written(text: str, folder: str | PathLike[str], name: str) -> Path:
+    """A page in `folder`; returns its path. Raises `InputError` where it cannot be written."""
+    path = Path(folder) / name
     with atomic(path) as stream:
         stream.write(text)
     return path
 
 
-def _placebo(found: Diagnosis) -> str | None:
-    shrinkage = found.shrinkage
-    if shrinkage is None or shrinkage.placebo is None or shrinkage.placebo_effect is None:
-        return None
-    closed = percent(shrinkage.placebo)
-    return f"A placebo ({shrinkage.placebo_effect}, a wrong effect added to the verdict) closes {closed}."
+def picture_of(
+    name: str,
+    draw: Callable[[bool], Figure],
+    says: str,
+    *tables: Table,
+    caption: str = "",
+    opened: bool = False,
+) -> Picture:
+    """What `draw` makes of False, for a desk, and of True, for a phone."""
+    wide, narrow = (inline_svg(f"{name}-{kind}", draw(kind == "narrow"), says) for kind in ("wide", "narrow"))
+    return Picture(wide, narrow, says, caption, tables, opened)
+
+
+def small_picture(name: str, figure: Figure, says: str, *tables: Table, caption: str = "") -> Picture:
+    """A figure as wide as a phone, beside another on a desk."""
+    return Picture(inline_svg(name, figure, says), Markup(""), says, caption, tables)
+
+
+def inline_svg(name: str, figure: Figure, says: str) -> Markup:
+    """A figure as SVG for the page: text as text, no date, equal for equal figures.
+
+    `name` begins its ids and is the page's only one; `says` is its text alternative. A colour of the house's palette
+    becomes the style's variable.
+    """
+    import matplotlib as mpl
+
+    stream = io.StringIO()
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "avtorch"}):
+        # no ground of its own: the page's paper shows through
+        figure.savefig(
+            stream, format="svg", transparent=True, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        )
+    text = stream.getvalue()
+    text = text[text.index("<svg") :]  # the prologue has no place inside a page
+    view = re.search(r'viewBox="[^"]*"', text)
+    assert view is not None, "matplotlib writes the extent of every SVG"
+    text = text[text.index(">") + 1 :]
+    # a style inside a picture would be the whole page's; the page has its own
+    text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", text, flags=re.DOTALL)
+    text = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", text)
+    text = re.sub(r"((?:fill|stroke): )(#[0-9a-f]{6})", _colour, text)
+    text = re.sub(r"-?\d+\.\d{3,}", lambda m: f"{float(m[0]):.2f}", text)
+    # letters are of one size on a desk, whatever the width of the figure
+    width = round(_PX_A_POINT * 72 * figure.get_figwidth())
+    opening = Markup('<svg class="picture" role="img" aria-label="{}" {} style="max-width: {}px">')
+    # matplotlib escapes what it writes
+    return opening.format(printable(says), Markup(view[0]), width) + Markup(text)
+
+
+def _colour(found: re.Match[str]) -> str:
+    return found[1] + (f"var(--{_COLOURS[found[2]]})" if found[2] in _COLOURS else found[2])
+
+
+def fragment(template: str, **values: Any) -> Markup:
+    """A part of a page by its template in this package."""
+    return Markup(_template(template).render(**values))
+
+
+def text_of(name: str) -> str:
+    """A file of this package."""
+    return files("avtorch.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _template(name: str) -> Any:
+    environment = Environment(
+        autoescape=True,
+        undefined=StrictUndefined,
+        finalize=_seen,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        loader=FunctionLoader(text_of),
+    )
+    return environment.get_template(name)
+
+
+def _digest(script: str) -> str:
+    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+def _seen(value: Any) -> Any:
+    """Text of a page, its control characters escaped; markup of our own, the pictures, as it is."""
+    return value if isinstance(value, Markup) or not isinstance(value, str) else printable(value)

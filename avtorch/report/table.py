@@ -12,7 +12,8 @@ from avtorch.errors import InputError
 class Table:
     """`columns` (column,) of titles; `rows` (row,) of as many cells, the first of which names its row.
 
-    `caption`: what the table shows. `numeric`: titles of the columns of numbers. `marked`: numbers of the rows in bold.
+    `caption`: what the table shows. `numeric`: titles of the columns of numbers. `marked`: numbers of the rows in bold;
+    `soft`: of those that a terminal dims.
     Raises `InputError` where a row has another number of cells than there are columns.
 
     Example:
@@ -26,6 +27,7 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     numeric: Collection[str] = ()
     marked: Collection[int] = ()
+    soft: Collection[int] = ()
 
     def __post_init__(self) -> None:
         for i, row in enumerate(self.rows):

@@ -17,11 +17,13 @@ import pytest
 from rich.console import Console
 
 from avtorch.cli import main
-from avtorch.cli.diagnosis_table import bar, diagnosis_headline, diagnosis_notes, diagnosis_table
+from avtorch.cli.follower import print_diagnosis
+from avtorch.cli.talk import Talk, drawn
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, DeadTime, GapPlant, plant
 from avtorch.gap.result.diagnosis import Candidate, Diagnosis, GapSize, LogFacts, Quantity
 from avtorch.io import Log, read_answer
+from avtorch.report.diagnosis_tables import candidate_table
 from tests.gap.verdicts import near, verdict_of
 
 ROWS = 600
@@ -295,26 +297,33 @@ def logs() -> list[Log]:
     return [Log.from_arrays(**columns())]
 
 
-def lines(shown: object, width: int = 80) -> list[str]:
-    console = Console(width=width, highlight=False, no_color=True)
-    with console.capture() as seen:
-        console.print(shown)
-    return [line.rstrip() for line in seen.get().splitlines()]
+@pytest.fixture
+def printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[[Diagnosis], list[str]]:
+    """What a terminal of 200 columns shows of a diagnosis."""
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def lines(found: Diagnosis) -> list[str]:
+        print_diagnosis(Talk(json=False, quiet=False), found)
+        return [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+
+    return lines
+
+
+def test_table(logs: list[Log]) -> None:
+    table = candidate_table(answer(logs))
+    assert table.rows[0] == ("dead_time", "0.930", "+1234", "delay 0.182 (0.175 to 0.189) s")
+    # both of the pair have a half width: there the effect is named
+    assert "backlash: half width 0.1 (" in table.rows[2][3]
+    assert "dead_band: half width -0.2 (" in table.rows[2][3]
+    assert [row[:2] for row in table.rows[-2:]] == [("unknown", "0.010"), ("none", "<.001")]
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_table(logs: list[Log], width: int) -> None:
-    told = lines(diagnosis_table(answer(logs)), width)
-    assert max(map(len, told)) <= width
-    assert told[0].split() == ["hypothesis", "probability", "nats", "parameters", "(90", "%)"]
-    assert told[1].startswith("dead_time ")
-    assert "0.930 ███████▌" in told[1]
-    assert "+1234  delay 0.182 s (0.175 to 0.189)" in told[1]
-    whole = "\n".join(told)
-    # both of the pair have a half width: there the effect is named
-    assert "backlash: half width 0.100 m/s²" in whole
-    assert "dead_band: half width -0.200 m/s²" in whole
-    assert [line.split()[:2] for line in told[-2:]] == [["unknown", "0.010"], ["none", "<.001"]]
+def test_table_fits_the_terminal(logs: list[Log], width: int) -> None:
+    console = Console(width=width, highlight=False, no_color=True)
+    with console.capture() as seen:
+        console.print(drawn(candidate_table(answer(logs))))
+    assert max(len(line.rstrip()) for line in seen.get().splitlines()) <= width
 
 
 def test_table_of_many_candidates_stays_short(logs: list[Log]) -> None:
@@ -323,27 +332,27 @@ def test_table_of_many_candidates_stays_short(logs: list[Log]) -> None:
     found = answer(
         logs, (Candidate("dead_time", 0.5, 9.0), *weak, Candidate("none", 0.04, 0.0), Candidate("unknown", 0.04))
     )
-    told = lines(diagnosis_table(found))
-    assert len(told) == 1 + 8 + 1
-    assert told[-1].split()[:3] == [str(len(names) - 5), "others", f"{0.02 * (len(names) - 5):.3f}"]
-    assert {"none", "unknown"} <= {line.split()[0] for line in told}
+    rows = candidate_table(found, most=8).rows
+    assert len(rows) == 8 + 1
+    assert rows[-1][:2] == (f"{len(names) - 5} others", f"{0.02 * (len(names) - 5):.3f}")
+    assert {"none", "unknown"} <= {row[0] for row in rows}
 
 
-def test_headline_for_each_kind_of_verdict(logs: list[Log]) -> None:
+def test_headline_for_each_kind_of_verdict(logs: list[Log], printed: Callable[[Diagnosis], list[str]]) -> None:
     def said(name: str, p: float = 0.9) -> str:
         others = tuple(Candidate(n, 0.0) for n in ("none", "unknown") if n != name)
-        return lines("\n".join(diagnosis_headline(answer(logs, (Candidate(name, p), *others)))), 200)[0]
+        return printed(answer(logs, (Candidate(name, p), *others)))[0]
 
     assert said("none") == "The simulator lacks nothing that this log shows (probability over 0.99)."
     late = "the command acts after a delay (dead_time)"
     assert said("dead_time", 0.9) == f"The simulator lacks this (probability over 0.99): {late}."
     unsure = (Candidate("dead_time", 0.6), Candidate("gust", 0.4), Candidate("none", 0.0), Candidate("unknown", 0.0))
-    assert diagnosis_headline(answer(logs, unsure))[0].startswith("[bold cyan]Probably the simulator lacks this")
+    assert printed(answer(logs, unsure))[0].startswith("Probably the simulator lacks this")
     assert said("unknown").startswith("The cause is not among the effects known here")
     weak = (Candidate("unknown", 0.38), Candidate("gust", 0.31), Candidate("dead_time", 0.31), Candidate("none", 0.0))
-    assert diagnosis_headline(answer(logs, weak))[0] == (
-        "[bold yellow]No cause can be named: perhaps it is not among the effects known here (probability 0.38), "
-        "perhaps too weak to tell.[/]"
+    assert printed(answer(logs, weak))[0] == (
+        "No cause can be named: perhaps it is not among the effects known here (probability 0.38), perhaps too weak to "
+        "tell."
     )
     assert said("dead_time+gust") == (
         f"The simulator lacks this (probability over 0.99): {late}, "
@@ -351,12 +360,16 @@ def test_headline_for_each_kind_of_verdict(logs: list[Log]) -> None:
     )
 
 
-def test_notes(logs: list[Log]) -> None:
+def test_notes(logs: list[Log], printed: Callable[[Diagnosis], list[str]]) -> None:
+    def noted(found: Diagnosis) -> list[str]:
+        """What stands below the table."""
+        lines = printed(found)
+        return lines[len(lines) - lines[::-1].index("") :]
+
     remaining = (Candidate("none", 0.1, 0.0), Candidate("aerodynamic_drag", 0.897, 40.0), Candidate("gust", 0.003))
     both = verdict_of(CANDIDATES, aliases=near(0.04))
     more = {"onset_s": 132.42, "remaining": remaining, "complete": False, "notes": ("speed [only]",)}
-    notes = diagnosis_notes(answer(logs, verdict=both, **more))
-    told = lines("\n".join(notes), 200)
+    told = noted(answer(logs, verdict=both, **more))
     assert told[0] == "This log cannot distinguish dead_time from second_order_actuator."
     assert told[1] == "The gap begins at 132.4 s of the log's time."
     assert told[2] == "Baseline fitted without and with the effect: T_L 0.52 → 0.31 s, K_L 1.02 → 0.99."
@@ -369,23 +382,17 @@ def test_notes(logs: list[Log]) -> None:
     assert told[6] == "speed [only]"
 
     sure = verdict_of(CANDIDATES, aliases=lambda ranked: ())
-    told = lines("\n".join(diagnosis_notes(answer(logs, verdict=sure))), 200)
+    told = noted(answer(logs, verdict=sure))
     assert told[:2] == [
         "No other known cause explains this log as well.",
         "The gap is there from the start.",
     ]
     wide = verdict_of(CANDIDATES, aliases=lambda ranked: ["none", "unknown", "backlash+dead_band"])
-    told = lines("\n".join(diagnosis_notes(answer(logs, verdict=wide))), 200)
+    told = noted(answer(logs, verdict=wide))
     assert told[0] == (
         "This log cannot distinguish dead_time from no effect at all, a cause outside the table or "
         "backlash with dead_band."
     )
     many = Candidate("dead_time", 0.3, 9.0), *(Candidate(n, 0.05, 1.0) for n in sorted(EFFECTS) if n != "dead_time")
-    told = lines("\n".join(diagnosis_notes(answer(logs, (*many, *CANDIDATES[-2:])))), 200)
+    told = noted(answer(logs, (*many, *CANDIDATES[-2:])))
     assert told[0].endswith("command_hold or any of 17 less probable hypotheses.")
-
-
-def test_bar() -> None:
-    assert [bar(p) for p in (0.0, 1.0, 0.5)] == [" " * 8, "█" * 8, "████    "]
-    assert bar(1 / 64) == "▏       "
-    assert len({len(bar(p / 100)) for p in range(101)}) == 1

@@ -10,9 +10,10 @@ import pytest
 from rich.console import Console
 
 from avtorch import GLVDPlant, Leader, estimate, simulate
-from avtorch.cli import progress_lines
-from avtorch.cli.finished_windows import NAME, finished_windows
-from avtorch.cli.progress_lines import ProgressLines
+from avtorch.cli import talk
+from avtorch.cli.estimate import LINES as NAME
+from avtorch.cli.estimate import finished_windows
+from avtorch.cli.talk import ProgressLines
 from avtorch.errors import InputError
 from avtorch.results import window_entry
 
@@ -54,7 +55,7 @@ def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) -
 
 def test_lines_tell_the_share_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([0.0, 4.0, 12.0, 15.0, 25.0])
-    monkeypatch.setattr(progress_lines.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(talk.time, "monotonic", lambda: next(clock))
     out = io.StringIO()
     lines = ProgressLines(Console(file=out), "Estimating")
     for done in (10, 30, 40, 50):
@@ -67,7 +68,7 @@ def test_lines_tell_the_share_and_the_time_left(monkeypatch: pytest.MonkeyPatch)
 
 def test_lines_name_the_stage_where_there_are_several(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([0.0, 20.0])
-    monkeypatch.setattr(progress_lines.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(talk.time, "monotonic", lambda: next(clock))
     out = io.StringIO()
     ProgressLines(Console(file=out), "Diagnosing")(250, 1000, "pairs")
     assert out.getvalue().splitlines() == ["Diagnosing: 25 %, about 60 s left (pairs)"]
@@ -76,7 +77,7 @@ def test_lines_name_the_stage_where_there_are_several(monkeypatch: pytest.Monkey
 def test_what_comes_first_tells_its_own_time_and_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
     """A simulator of 31 s, driven before any step of the diagnosis, made that seem to take half an hour."""
     clock = iter([0.0, 0.1, 31.0, 51.0])
-    monkeypatch.setattr(progress_lines.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(talk.time, "monotonic", lambda: next(clock))
     out = io.StringIO()
     lines = ProgressLines(Console(file=out), "Diagnosing")
     for stage, done in (("driving the simulator, about 31 s", 0), ("simulator", 0), ("single effects", 200)):

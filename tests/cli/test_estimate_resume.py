@@ -12,8 +12,8 @@ import pytest
 
 import avtorch.results
 from avtorch.cli import main
-from avtorch.cli.finished_windows import NAME
-from avtorch.cli.resume import WINDOWS
+from avtorch.cli.estimate import LINES as NAME
+from avtorch.cli.estimate import STATE as WINDOWS
 from avtorch.decision import kept_windows
 from avtorch.io import Log
 

@@ -25,14 +25,15 @@ import avtorch.gap.compare
 import avtorch.paper
 import avtorch.plots.style
 import avtorch.report
-import avtorch.report.comparison_page
-import avtorch.report.page
-import avtorch.report.validation_page
+import avtorch.report.comparison
+import avtorch.report.diagnosis
+import avtorch.report.validation
 import avtorch.results
 import avtorch.validation
 import avtorch.vehicle.stability
 from avtorch.cli import main
 from avtorch.gap import DeadTime, plant
+from avtorch.report.table import Table
 from tests.cli.test_diagnose import answer, columns, write
 from tests.faulty_disk import disk, fails, interrupts, old_or_new, tree, visible
 
@@ -102,7 +103,7 @@ def diagnose(c: Command) -> None:
     manoeuvre = SimpleNamespace(time=np.zeros(1), command=np.zeros(1), speed=np.zeros(1))
     ahead = {"old": SimpleNamespace(manoeuvre=manoeuvre, to_dict=lambda: None), "new": None}
     c.stand_in(avtorch.experiment, "next_experiment", lambda *_, **__: ahead[c.of])
-    c.stand_in(sys.modules["avtorch.report.page"], "report_html", lambda *_, **__: f"page of {c.of}")
+    c.stand_in(sys.modules["avtorch.report.diagnosis"], "report_html", lambda *_, **__: f"page of {c.of}")
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ def follower(c: Command) -> None:
     given = {"old": {"plant": plant([DeadTime(0.182)])}, "new": {"plant": None}}
     c.stand_in(avtorch.follower, "diagnose_follower", lambda log, **_: Followed(c.of, answer([log], **given[c.of])))
     c.stand_in(avtorch.follower.words, "loop_lines", lambda found: [found.of])
-    c.stand_in(sys.modules["avtorch.report.page"], "report_html", lambda *_, **__: f"page of {c.of}")
+    c.stand_in(sys.modules["avtorch.report.diagnosis"], "report_html", lambda *_, **__: f"page of {c.of}")
 
 
 def comparison(c: Command) -> None:
@@ -134,7 +135,7 @@ def comparison(c: Command) -> None:
     c.lines = {of: ["compare", log, log] for of in ("old", "new")}
     told = lambda *_, **__: SimpleNamespace(why=c.of, car={}, gap={}, cause=None, to_dict=lambda: {"why": c.of})  # noqa: E731
     c.stand_in(avtorch.gap.compare, "compare", told)
-    c.stand_in(avtorch.report.comparison_page, "comparison_html", lambda *_, **__: f"page of {c.of}")
+    c.stand_in(avtorch.report.comparison, "comparison_html", lambda *_, **__: f"page of {c.of}")
 
 
 class Netcdf:
@@ -163,10 +164,10 @@ def validate(c: Command) -> None:
     c.stand_in(sys.modules["avtorch.validation.validate"], "check_installed", lambda: None)
     c.stand_in(avtorch.validation, "validate", lambda *_, **__: told)
     c.stand_in(avtorch.results, "validation_answer", lambda _: {"verdict": "agree", "why": c.of})
-    c.stand_in(avtorch.report.validation_page, "validation_html", lambda *_, **__: f"page of {c.of}")
+    c.stand_in(avtorch.report.validation, "validation_html", lambda *_, **__: f"page of {c.of}")
     c.stand_in(avtorch.plots, "validation_figures", lambda _: {x: lambda x=x: f"{x} of {c.of}" for x in pictures[c.of]})
-    for name in ("validation_table", "validation_notes"):
-        c.stand_in(sys.modules["avtorch.cli.validate"], name, lambda _: "")
+    c.stand_in(avtorch.report.validation, "validation_table", lambda _: Table("", ("",), ()))
+    c.stand_in(avtorch.report.validation, "validation_notes", lambda _: ())
 
 
 def paper(c: Command) -> None:
@@ -178,8 +179,9 @@ def paper(c: Command) -> None:
     told = SimpleNamespace(answer=lambda: {"of": c.of, "leaders": {}}, found={})
     c.stand_in(avtorch.paper, "reproduce", lambda *_, **__: told)
     c.stand_in(avtorch.plots, "paper_pictures", lambda _: {x: lambda x=x: f"{x} of {c.of}" for x in pictures[c.of]})
-    for name in ("counts_table", "rows_table", "missed"):
-        c.stand_in(sys.modules["avtorch.cli.paper"], name, lambda _: "")
+    for name in ("counts_table", "rows_table"):
+        c.stand_in(sys.modules["avtorch.cli.paper"], name, lambda _: Table("", ("",), ()))
+    c.stand_in(sys.modules["avtorch.cli.paper"], "missed", lambda _: ())
 
 
 QUICK = [stability, comparison]

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from avtorch.cli.one_thread import use_one_thread
+from avtorch.cli.app import use_one_thread
 
 NAMES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 

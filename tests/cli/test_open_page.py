@@ -9,7 +9,6 @@ import pytest
 
 from avtorch import Leader, simulate
 from avtorch.cli import main
-from avtorch.cli.browser import show
 from avtorch.cli.talk import Talk
 from avtorch.gap import DeadTime, plant
 
@@ -64,5 +63,5 @@ def test_without_a_browser_the_page_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(webbrowser, "open", lambda _: False)
-    show(tmp_path / "fleet.html", Talk(json=False, quiet=False))
+    Talk(json=False, quiet=False).show(tmp_path / "fleet.html")
     assert capsys.readouterr().out == f"No browser was found to open {tmp_path / 'fleet.html'}\n"

@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from avtorch.cli import main
-from avtorch.cli.app import app
-from avtorch.cli.out_folder import alone_in_out
+from avtorch.cli.app import alone_in_out, app
 from avtorch.io import sole_use
 
 COMMANDS = {"run", "estimate", "diagnose", "compare", "fleet", "stability", "validate", "paper"}

@@ -10,8 +10,8 @@ from unittest.mock import ANY
 import pytest
 
 from avtorch.cli import main
-from avtorch.cli.validation_table import validation_notes, validation_table
 from avtorch.io import read_answer
+from avtorch.report.validation import validation_notes, validation_table
 
 pytest.importorskip("arviz")
 pytest.importorskip("pyro")
@@ -128,7 +128,7 @@ def test_table_of_a_latent_log_names_its_parameter() -> None:
     }
     answer = {"summary": summary, "reference": "nuts"}
     table = validation_table(answer)
-    assert [str(cell) for cell in table.columns[0].cells][2] == r"process_noise \[m/s²/√s]"
+    assert table.rows[2][0] == "process_noise [m/s²/√s]"
     notes = validation_notes(answer)
-    assert notes[0].startswith("SGLD against nuts, 3 windows")
+    assert notes[0].startswith("Over 3 windows against NUTS")
     assert "quadrature" not in notes[1]

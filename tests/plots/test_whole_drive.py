@@ -12,7 +12,7 @@ from avtorch.errors import InputError
 from avtorch.gap.result.alarm import Alarm
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import Uncounted
-from avtorch.plots.whole_drive import drive_figure, drive_time, envelope
+from avtorch.plots.drive import drive_figure, drive_time, envelope
 
 STEP = 0.05
 

@@ -17,7 +17,7 @@ from avtorch.gap.result.comparison import Change, Comparison
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.inference import SamplerSettings
 from avtorch.report import Origin, comparison_html, estimates_html, run_html, validation_html
-from avtorch.report.run_page import Regions
+from avtorch.report.run import Regions
 from avtorch.results import estimates_answer
 from avtorch.validation import NutsSettings, synthetic_windows, validate
 from tests.report.conftest import HOSTILE

@@ -12,7 +12,7 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.report import Origin, fleet_html, write_fleet_page
-from avtorch.report.fleet_page import PLAIN
+from avtorch.report.fleet import PLAIN
 from tests.report.conftest import HOSTILE
 from tests.report.fleets import answer_of
 from tests.report.tree import Element, read

@@ -11,7 +11,8 @@ import pytest
 import torch
 
 import avtorch
-from avtorch.cli.command_line import command_line, given
+from avtorch.cli.app import main
+from avtorch.cli.arguments import COMMAND_LINE
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.report import Origin, report_html
 from tests.report.tree import read
@@ -51,7 +52,9 @@ def test_recordings_that_are_folders_and_logs_of_one_name(tmp_path: Path) -> Non
     assert list(Origin.of(None, [tmp_path / "one"]).files) == [str(Path("one", "lap.csv"))]
 
 
-def test_the_command_line_is_quoted_and_known_only_within_a_command() -> None:
-    with given(["diagnose", "my lap.csv"]):
-        assert command_line() == "avtorch diagnose 'my lap.csv'"
-    assert command_line() is None
+def test_the_command_line_is_quoted_and_known_only_within_a_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[str | None] = []
+    monkeypatch.setattr("avtorch.cli.app.app", lambda *_, **__: seen.append(COMMAND_LINE.get()))
+    assert main(["diagnose", "my lap.csv"]) == 0
+    assert seen == ["avtorch diagnose 'my lap.csv'"]
+    assert COMMAND_LINE.get() is None

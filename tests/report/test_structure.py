@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import re
 from itertools import pairwise
 
@@ -105,11 +103,7 @@ def test_it_requests_nothing(name: str, page: Element) -> None:
     assert not list(page.all("link", "img", "iframe", "object", "embed", "video", "audio"))
     clouds = list(page.all("image"))
     assert bool(clouds) == (name == "validation")
-    scripts = list(page.all("script"))
-    lines = any("data-curves" in svg.attributes for svg in page.all("svg"))
-    assert [script.attributes for script in scripts] == [{}] * lines, (
-        "the page's own, within it, where it has lines to read"
-    )
+    assert not list(page.all("script"))
     for element in page.all():
         for attribute, value in element.attributes.items():
             if element.tag == "image" and attribute == "xlink:href":
@@ -123,10 +117,8 @@ def test_it_requests_nothing(name: str, page: Element) -> None:
     (style,) = page.all("style")
     assert not re.search(r"url\(|@import", style.text())
     policy = next(x for x in page.all("meta") if x.attributes.get("http-equiv") == "Content-Security-Policy")
-    digests = [base64.b64encode(hashlib.sha256(script.words[0].encode()).digest()).decode() for script in scripts]
     images = "; img-src data:" if clouds else ""
-    own = "".join(f"; script-src 'sha256-{digest}'" for digest in digests)
-    assert policy.attributes["content"] == f"default-src 'none'; style-src 'unsafe-inline'{images}{own}"
+    assert policy.attributes["content"] == f"default-src 'none'; style-src 'unsafe-inline'{images}"
 
 
 def test_a_hostile_name_is_text(name: str, text: str) -> None:

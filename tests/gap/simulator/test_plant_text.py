@@ -10,7 +10,7 @@ import torch
 
 import avtorch.gap as gap
 from avtorch.cli.app import main
-from avtorch.cli.simulator import read_simulator
+from avtorch.cli.simulators import read_simulator
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, Effect, GapPlant, plant
 from avtorch.gap.simulator.domain import Domain

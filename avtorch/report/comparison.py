@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from avtorch.gap.quantity import Quantity, unit_of, words_of
-from avtorch.plots.ratios import ratio_figure
-from avtorch.report.answer_page import AnswerPage, Section, Tone, answer_html, written
 from avtorch.report.origin import Origin
-from avtorch.report.picture import Picture, picture_of
+from avtorch.report.page import Page, Picture, Section, Tone, picture_of, written
 from avtorch.report.table import Table
 
 if TYPE_CHECKING:
@@ -53,7 +51,7 @@ def comparison_html(
     from avtorch.gap.result.comparison import Comparison
 
     page = _of_drives(found, notes) if isinstance(found, Comparison) else _of_simulators(found, notes)
-    return answer_html(page, origin=origin)
+    return page.html(origin)
 
 
 def write_comparison_page(
@@ -75,28 +73,78 @@ def write_comparison_page(
     return written(comparison_html(found, notes=notes, origin=origin), folder, "comparison.html")
 
 
+def comparison_tables(found: Comparison | SimulatorComparison) -> tuple[Table, ...]:
+    """The errors before and after, or of the first and the second; and what has changed or differs, where known."""
+    from avtorch.gap.result.comparison import Comparison
+
+    if isinstance(found, Comparison):
+        moved = {**found.car, **found.gap}
+        rows = [
+            (_row_name(name, found.horizon_s), *map(_told, (m.before, m.after, m.ratio))) for name, m in moved.items()
+        ]
+        columns = ("quantity", "before (90 %)", "after (90 %)", "after / before (90 %)")
+        table, more = Table("Before and after", columns, tuple(rows), numeric=columns[1:]), _cause_table(found.cause)
+        return (table,) if more is None else (table, more)
+    errors = found.errors.items()
+    rows = [(_row_name(name, found.horizon_s), *map(_told, (e.first, e.second, e.ratio))) for name, e in errors]
+    rows.append(("both, geometric mean", "", "", _told(found.ratio)))
+    columns = ("error", "first (90 %)", "second (90 %)", "second / first (90 %)")
+    table = Table("Errors of the two", columns, tuple(rows), numeric=columns[1:])
+    what = [
+        (
+            ", ".join(d.parts),
+            *(("", "") if len(d.parts) > 1 else (_side(d.first), _side(d.second))),
+            f"× {_told(d.ratio)}",
+        )
+        for d in found.differences
+    ]
+    titles = ("difference", "first", "second", "error of the farther (90 %)")
+    return (table, Table("What the two have differently", titles, tuple(what))) if what else (table,)
+
+
+def _cause_table(cause: ChangeCause | None) -> Table | None:
+    """Parts of the change, or the least changes that would show."""
+    if cause is None:
+        return None
+    if not cause.parts:
+        from avtorch.gap.answer.change import detectable_text
+
+        least = tuple((name, detectable_text(name, x)) for name, x in cause.detectable.items())
+        return Table("What would show", ("least change that would show", "size"), least) if least else None
+    sides = ("before (90 %)", "after (90 %)", "change (90 %)")
+    rows = []
+    for part in cause.parts:
+        cells: dict[str, list[str]] = {side: [] for side in sides}
+        for key, q in part.parameters.items():
+            side = next((s for s in ("before", "after") if key.startswith(s)), "change")
+            word = "" if key.startswith(side) else f"{words_of(key)} "
+            cells[f"{side} (90 %)"].append(f"{word}{_told(q)}{_unit(key)}")
+        alike = ", ".join(name for name in part.alias_set if name != part.name) or "nothing"
+        name = f"{'less ' if part.less else ''}{part.name}"
+        rows.append((name, f"{part.probability:.2f}", *map("; ".join, cells.values()), alike))
+    columns = ("what", "probability", *sides, "cannot be told from")
+    return Table("Parts of the change", columns, tuple(rows), numeric=("probability",))
+
+
 # two sets of drives ------------------------------------------------------------------------------------------------
-def _of_drives(found: Comparison, notes: Sequence[str]) -> AnswerPage:
+def _of_drives(found: Comparison, notes: Sequence[str]) -> Page:
     said, tone = _OF_SIMULATOR[found.simulator]
     one_drive = found.before == found.after
     car = "The car has changed" if found.changed else "No change of T_L and K_L is detected"
-    heading = _ONE_DRIVE[found.simulator] if one_drive else f"{car}; {said}"
-    moved = {**found.car, **found.gap}
-    names = [_ROWS.get(name, name).format(horizon=f"{found.horizon_s:.3g}") for name in moved]
-    columns = ("quantity", "before (90 %)", "after (90 %)", "after / before (90 %)")
-    rows = tuple(
-        (name, *(_told(q) for q in (m.before, m.after, m.ratio))) for name, m in zip(names, moved.values(), strict=True)
-    )
-    table = Table("Before and after", columns, rows, numeric=columns[1:])
-    ratios = {n: m.ratio for n, m in zip(names, moved.values(), strict=True)}
+    table, *more = comparison_tables(found)
+    ratios = {_row_name(n, found.horizon_s): m.ratio for n, m in {**found.car, **found.gap}.items()}
     none = "An interval that crosses the dashed line cannot be told from no change."
-    picture = _ratios("after / before", ratios, table, none)
-    return AnswerPage(
+    cause = () if found.cause is None or found.cause.why in found.why else (found.cause.why,)
+    return Page(
         "Comparison",
         _facts(found.before) if one_drive else f"before: {_facts(found.before)}; after: {_facts(found.after)}",
-        Section(heading, (found.why,), (picture,)),
+        Section(
+            _ONE_DRIVE[found.simulator] if one_drive else f"{car}; {said}",
+            (found.why,),
+            (_ratios("after / before", ratios, table, none),),
+        ),
         (
-            _cause(found.cause, found.why),
+            Section("What has changed", cause, tables=tuple(more)),
             Section("The data", items=tuple(notes)),
             Section(
                 "Method and limits",
@@ -116,73 +164,25 @@ def _facts(log: LogFacts) -> str:
     return f"{log.name}, {log.seconds:.0f} s"
 
 
-def _cause(cause: ChangeCause | None, told: str) -> Section:
-    """What the sentences `told` above do not say of it."""
-    if cause is None:
-        return Section("What has changed")
-    lines = () if cause.why in told else (cause.why,)
-    columns = ("what", "probability", *_SIDES, "cannot be told from")
-    rows = []
-    for part in cause.parts:
-        sides = {side: "" for side in _SIDES}
-        for key, q in part.parameters.items():
-            side = next((s for s in ("before", "after") if key.startswith(s)), "change")
-            word = "" if key.startswith(side) else f"{words_of(key)} "
-            sides[f"{side} (90 %)"] += f"{'; ' if sides[f'{side} (90 %)'] else ''}{word}{_told(q)}{_unit(key)}"
-        alike = ", ".join(name for name in part.alias_set if name != part.name) or "nothing"
-        name = f"{'less ' if part.less else ''}{part.name}"
-        rows.append((name, f"{part.probability:.2f}", *sides.values(), alike))
-    if rows:
-        table = Table("Parts of the change", columns, tuple(rows), numeric=("probability",))
-        return Section("What has changed", lines, tables=(table,))
-    from avtorch.gap.answer.change import detectable_text
-
-    least = tuple(
-        f"Least change of {name} that would show: {detectable_text(name, x)}." for name, x in cause.detectable.items()
-    )
-    return Section("What has changed", lines, items=least)
-
-
-_SIDES = ("before (90 %)", "after (90 %)", "change (90 %)")
-
-
 # two simulators ----------------------------------------------------------------------------------------------------
-def _of_simulators(found: SimulatorComparison, notes: Sequence[str]) -> AnswerPage:
+def _of_simulators(found: SimulatorComparison, notes: Sequence[str]) -> Page:
     nearer = found.nearer
     title = "These drives cannot tell which simulator is nearer"
     if nearer is not None:
         which = found.first if nearer == "first" else found.second
         title = f"The {nearer} simulator is nearer to the car: {which.name}"
-    names = [_ROWS[name].format(horizon=f"{found.horizon_s:.3g}") for name in found.errors]
-    columns = ("error", "first (90 %)", "second (90 %)", "second / first (90 %)")
-    rows = [
-        (name, *(_told(q) for q in (e.first, e.second, e.ratio)))
-        for name, e in zip(names, found.errors.values(), strict=True)
-    ]
-    rows.append(("both, geometric mean", "", "", _told(found.ratio)))
-    table = Table("Errors of the two", columns, tuple(rows), numeric=columns[1:])
-    ratios = {n: e.ratio for n, e in zip(names, found.errors.values(), strict=True)}
+    table, *differences = comparison_tables(found)
+    ratios = {_row_name(n, found.horizon_s): e.ratio for n, e in found.errors.items()} | {"both": found.ratio}
     equal = (
         "An interval that crosses the dashed line cannot be told from equal errors; right of it the first is nearer."
     )
-    picture = _ratios("error of the second / of the first", ratios | {"both": found.ratio}, table, equal)
-    what = tuple(
-        (
-            ", ".join(d.parts),
-            *(("", "") if len(d.parts) > 1 else (_side(d.first), _side(d.second))),
-            f"× {_told(d.ratio)}",
-        )
-        for d in found.differences
-    )
-    titles = ("difference", "first", "second", "error of the farther (90 %)")
-    differences = (Table("What the two have differently", titles, what),) if what else ()
     remarks = [f"{which.name}: {note}" for which in (found.first, found.second) for note in which.notes]
-    return AnswerPage(
+    return Page(
         "Comparison",
         f"{_facts(found.log)}; first: {found.first.name}, second: {found.second.name}",
-        Section(title, (found.why,), (picture,)),
+        Section(title, (found.why,), (_ratios("error of the second / of the first", ratios, table, equal),)),
         (
-            Section("What makes the difference", tables=differences),
+            Section("What makes the difference", tables=tuple(differences)),
             Section("The data", items=(*notes, *remarks)),
             Section(
                 "Method and limits",
@@ -205,6 +205,8 @@ def _side(values: Mapping[str, float] | None) -> str:
 
 # both --------------------------------------------------------------------------------------------------------------
 def _ratios(what: str, ratios: Mapping[str, Quantity], table: Table, caption: str) -> Picture:
+    from avtorch.plots.ratios import ratio_figure
+
     told = "; ".join(f"{name} {_told(q)}" for name, q in ratios.items())
     return picture_of(
         "ratios",
@@ -214,6 +216,10 @@ def _ratios(what: str, ratios: Mapping[str, Quantity], table: Table, caption: st
         caption=caption,
         opened=True,
     )
+
+
+def _row_name(name: str, horizon_s: float) -> str:
+    return _ROWS.get(name, name).format(horizon=f"{horizon_s:.3g}")
 
 
 def _told(q: Quantity) -> str:

@@ -1,17 +1,16 @@
-"""What is left of the gap, as pictures, words and tables: residuals without and with what was named."""
+"""What is left of the gap, as a section of the diagnosis's page: residuals without and with what was named."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.residuals import BLOCK_S, BinnedMeans, Residuals
-from avtorch.plots.residuals import Against, residual_figure, residual_time_figure, residuals_of, sides
-from avtorch.report.picture import Picture, picture_of, small_picture
+from avtorch.plots import drive
+from avtorch.report.page import Picture, Section, picture_of, small_picture
 from avtorch.report.table import Table, of_numbers
 
 _PARTS = 12  # of the drive, rows of its table
@@ -19,45 +18,26 @@ _ROWS = 15  # of a table behind a line
 _LEAST = 100  # rows from which there is something to see
 
 
-@dataclass(frozen=True)
-class ResidualSection:
-    """The section's sentences, the picture over the whole drive, and the small ones."""
-
-    lines: tuple[str, ...]
-    over_time: Picture
-    pictures: tuple[Picture, ...]
-
-
-def residual_section(found: Diagnosis) -> ResidualSection | None:
-    """The residuals of a diagnosis; None where there is too little to show.
-
-    Example:
-        >>> from avtorch import Leader, diagnose, simulate
-        >>> from avtorch.gap import DeadTime, plant
-        >>> from avtorch.report.residual_section import residual_section
-        >>> late = plant([DeadTime(0.4)], sigma=0.0)
-        >>> log = simulate(Leader.default(start=50.0, duration=24.0, dt=0.1), plant=late).log()
-        >>> len(residual_section(diagnose(log, effects=["dead_time"], pairs=False)).pictures)
-        4
-    """
+def residuals(found: Diagnosis) -> Section:
+    """The residuals of a diagnosis; nothing where there is too little to show."""
+    title = "What is left: residuals"
     if found.traces is None or len(found.traces.time) < _LEAST:
-        return None
-    left = residuals_of(found)
+        return Section(title)
+    left = drive.residuals_of(found)
     if len(left.time) < _LEAST:
-        return None
-    both = sides(found, left)
-    judged = left.after if found.winner.effects else left.before
-    against: list[tuple[Against, FloatArray]] = [("command", left.command)]
+        return Section(title)
+    both = drive.sides(found, left)
+    against: list[tuple[drive.Against, FloatArray]] = [("command", left.command)]
     if left.speed is not None:
         against.append(("speed", left.speed))
     pictures = [_against(found, left, both, name, axis) for name, axis in against]
-    pictures += [_correlation(found, left, both)]
-    if left.spectrum(judged) is not None:
+    pictures.append(_correlation(found, left, both))
+    if left.spectrum(list(both.values())[-1]) is not None:
         pictures.append(_spectrum(found, left, both))
-    return ResidualSection(_lines(found, left, both), _over_time(found, left, both), tuple(pictures))
+    return Section(title, _what_is_left(left, both), (_over_time(found, left, both),), tuple(pictures))
 
 
-def _lines(found: Diagnosis, left: Residuals, both: Mapping[str, FloatArray]) -> tuple[str, ...]:
+def _what_is_left(left: Residuals, both: Mapping[str, FloatArray]) -> tuple[str, ...]:
     what = (
         "Measured acceleration less that of a rollout over the whole drive"
         if left.channel == "accel"
@@ -90,31 +70,30 @@ def _apart(bins: BinnedMeans) -> bool:
 
 
 def _over_time(found: Diagnosis, left: Residuals, both: Mapping[str, FloatArray]) -> Picture:
-    columns = ["part of the drive [s]"]
-    for label in both:
-        columns += [f"mean {label} [m/s²]", f"SD {label} [m/s²]"]
-    rows = []
-    for part in np.array_split(np.arange(len(left.time)), _PARTS):
-        cells = [f"{left.time[part[0]]:.0f} to {left.time[part[-1]]:.0f}"]
-        for residual in both.values():
-            cells += [f"{residual[part].mean():.3f}", f"{residual[part].std():.3f}"]
-        rows.append(tuple(cells))
+    columns = ("part of the drive [s]", *(f"{what} {label} [m/s²]" for label in both for what in ("mean", "SD")))
+    rows = [
+        (
+            f"{left.time[part[0]]:.0f} to {left.time[part[-1]]:.0f}",
+            *(f"{size:.3f}" for residual in both.values() for size in (residual[part].mean(), residual[part].std())),
+        )
+        for part in np.array_split(np.arange(len(left.time)), _PARTS)
+    ]
     label, judged = list(both.items())[-1]
     usual = left.usual(judged)
-    beyond = float(np.mean(np.abs(judged) > usual))
+    beyond = f"{100 * float(np.mean(np.abs(judged) > usual)):.1f} %"
     return picture_of(
         "residual-time",
-        lambda narrow: residual_time_figure(found, narrow=narrow),
-        f"Lines of the residual over the whole drive: {', '.join(both)}. {100 * beyond:.1f} % of the rows "
-        f"{label} lie beyond {usual:.2g} m/s².",
-        Table("Residual in parts of the drive", tuple(columns), tuple(rows), numeric=columns[1:]),
-        caption=f"Grey ground: where 99 % of a steady normal residual with the quartiles of the last line would lie; "
-        f"{100 * beyond:.1f} % lie beyond.",
+        lambda narrow: drive.residual_time_figure(found, narrow=narrow),
+        f"Lines of the residual over the whole drive: {', '.join(both)}. {beyond} of the rows {label} lie beyond "
+        f"{usual:.2g} m/s².",
+        Table("Residual in parts of the drive", columns, tuple(rows), numeric=columns[1:]),
+        caption="Grey ground: where 99 % of a steady normal residual with the quartiles of the last line would lie; "
+        f"{beyond} lie beyond.",
     )
 
 
 def _against(
-    found: Diagnosis, left: Residuals, both: Mapping[str, FloatArray], name: Against, axis: FloatArray
+    found: Diagnosis, left: Residuals, both: Mapping[str, FloatArray], name: drive.Against, axis: FloatArray
 ) -> Picture:
     unit = "m/s²" if name == "command" else "m/s"
     rows, says = [], []
@@ -127,7 +106,7 @@ def _against(
             rows.append((f"{place:.3g} {unit}", label, f"{mean:.3f}{within}"))
     return small_picture(
         f"residual-{name}",
-        residual_figure(found, name),
+        drive.residual_figure(found, name),
         f"Lines of the mean residual over the {name}: {', '.join(says)}.",
         Table(f"Mean residual by {name}", (name, "simulator", "mean residual (90 %) [m/s²]"), tuple(rows)),
         caption=f"Against the {name}: means of as many rows each; bands are 90 %, by blocks of {BLOCK_S:.0f} s.",
@@ -139,14 +118,13 @@ def _correlation(found: Diagnosis, left: Residuals, both: Mapping[str, FloatArra
     last = list(each.values())[-1]
     few = np.linspace(0, len(last.lag) - 1, _ROWS).astype(int)
     says = ", ".join(f"{label} {x.value[np.abs(x.value).argmax()]:.2f} at the most" for label, x in each.items())
-    columns = ("time since the command [s]", *each)
     return small_picture(
         "residual-correlation",
-        residual_figure(found, "earlier commands"),
+        drive.residual_figure(found, "earlier commands"),
         f"Lines of the residual's correlation with the command: {says}; by chance up to {last.band:.2f}.",
         of_numbers(
             f"Correlation with the command, by chance up to {last.band:.2f}",
-            columns,
+            ("time since the command [s]", *each),
             np.column_stack([last.lag, *(x.value for x in each.values())])[few].tolist(),
             (".2f", *(".3f" for _ in each)),
         ),
@@ -160,14 +138,13 @@ def _spectrum(found: Diagnosis, left: Residuals, both: Mapping[str, FloatArray])
     last = list(each.values())[-1]
     few = np.unique(np.geomspace(1, len(last.frequency), _ROWS).astype(int)) - 1
     says = ", ".join(f"{label} most at {x.frequency[x.power.argmax()]:.2g} Hz" for label, x in each.items())
-    columns = ("frequency [Hz]", *(f"{label} [(m/s²)²/Hz]" for label in each))
     return small_picture(
         "residual-frequency",
-        residual_figure(found, "frequency"),
+        drive.residual_figure(found, "frequency"),
         f"Lines of the residual's power over frequency: {says}.",
         of_numbers(
             "Power of the residual",
-            columns,
+            ("frequency [Hz]", *(f"{label} [(m/s²)²/Hz]" for label in each)),
             np.column_stack([last.frequency, *(x.power for x in each.values())])[few].tolist(),
             (".3g", *(".3g" for _ in each)),
         ),

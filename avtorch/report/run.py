@@ -14,14 +14,12 @@ import torch
 from numpy.typing import ArrayLike
 
 from avtorch.arrays import FloatArray
-from avtorch.plots.figures import Motion, motion_figure, overview_figure, region_figure
-from avtorch.plots.plane import loop_of
-from avtorch.plots.time import Steps
-from avtorch.report.answer_page import AnswerPage, Section, Tone, answer_html, written
+from avtorch.plots.plane import loop_of, region_figure
+from avtorch.plots.time import Motion, Steps, motion_figure, overview_figure
 from avtorch.report.origin import Origin
-from avtorch.report.picture import Picture, picture_of
+from avtorch.report.page import Page, Picture, Section, picture_of, written
 from avtorch.report.table import Table, of_numbers
-from avtorch.report.window_table import window_table
+from avtorch.report.window_tables import window_table
 from avtorch.results import MEASURES
 from avtorch.vehicle import stability
 
@@ -90,13 +88,14 @@ def run_html(
         f"{', '.join(dict.fromkeys(n for q in traces.values() for n in q))}.",
         _motion_table(time, traces),
     )
-    story = _story(answer)
-    page = AnswerPage(
+    story = story_table(answer)
+    more = 1 + len(_begun(answer)) + len(answer["actions"]) - len(story.rows)
+    page = Page(
         "Run",
         f"simulated drive of {answer['windows'][-1]['end_s']:g} s",
-        Section(_headline(answer), _lead(answer), (overview,), (_performance(answer),)),
+        Section(_headline(answer), _lead(answer), (overview,), tables=(performance_table(answer),)),
         (
-            Section("What happened", tables=(story,), items=_hidden(answer, story)),
+            Section("What happened", tables=(story,), items=(f"{more} more in run.json.",) if more else ()),
             Section("The motion", pictures=(motion,)),
             Section("Beliefs and stability regions", pictures=_regions(regions, truth)),
             Section(
@@ -109,9 +108,9 @@ def run_html(
                 ),
             ),
         ),
-        _tone(answer),
+        "green" if answer["windows"][-1]["p_string_stable"] >= 0.95 else "amber",
     )
-    return answer_html(page, origin=origin)
+    return page.html(origin)
 
 
 def write_run_page(answer: Mapping[str, Any], *args: Any, folder: str | PathLike[str], **more: Any) -> Path:
@@ -162,10 +161,14 @@ def _lead(answer: Mapping[str, Any]) -> tuple[str, ...]:
             f"The RMS of the follower's speed over that of its leader's is {with_:.2f} with action, {without:.2f} "
             "without; above 1 disturbances grow towards the traffic behind."
         )
-    hit = [s.replace("_", " ") for s, run in both.items() if (run.get("min_spacing_m") or 0.0) < 0]
-    if hit:
-        said.append(f"Collision {' and '.join(hit)}: everything after it, figures included, is not physical.")
-    return tuple(said)
+    return (*said, *collision(answer))
+
+
+def collision(answer: Mapping[str, Any]) -> list[str]:
+    """That one of the two drives ends in a collision."""
+    both = answer["performance"]
+    hit = [side.replace("_", " ") for side, run in both.items() if (run.get("min_spacing_m") or 0.0) < 0]
+    return [f"Collision {' and '.join(hit)}: everything after it, figures included, is not physical."] if hit else []
 
 
 def _at_the_end(answer: Mapping[str, Any]) -> str:
@@ -177,11 +180,8 @@ def _at_the_end(answer: Mapping[str, Any]) -> str:
     return f"{first}{least}is {windows[-1]['p_string_stable']:.2f} at the end"
 
 
-def _tone(answer: Mapping[str, Any]) -> Tone:
-    return "green" if answer["windows"][-1]["p_string_stable"] >= 0.95 else "amber"
-
-
-def _performance(answer: Mapping[str, Any]) -> Table:
+def performance_table(answer: Mapping[str, Any]) -> Table:
+    """The measures of the drive without and with action."""
     both = answer["performance"]
     sides = ("without_action", "with_action") if answer["actions"] else ("with_action",)
     columns = ("measure", *(side.replace("_", " ") if answer["actions"] else "value" for side in sides))
@@ -211,17 +211,20 @@ def _number(value: float | None) -> str:
     return "none" if value is None else f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
 
 
-def _story(answer: Mapping[str, Any]) -> Table:
+def story_table(answer: Mapping[str, Any], most: int = _MOST) -> Table:
+    """The change, alerts and actions in order, `most` of them."""
     change = answer["change"]
     lines = [
         (change["time_s"], "change", f"the vehicle changes to T_L {change['T_L']:g} s, K_L {change['K_L']:g}"),
-        *((a["time_s"], "alert", f"{a['detector']}: {a['why']}{_again(more)}") for a, more in _begun(answer)),
     ]
+    for a, more in _begun(answer):
+        again = f" (and in {more} more window{'s' * (more > 1)})" if more else ""
+        lines.append((a["time_s"], "alert", f"{a['detector']}: {a['why']}{again}"))
     for a in answer["actions"]:
         gain = "" if a["peak_gain_true"] is None else f"; true peak gain {a['peak_gain_true']:.4f}"
         lines.append((a["time_s"], "action", f"{_means(a)}: {a['why']}{gain}"))
     # the sort is stable: an action stays behind the alert of the same time that it answers
-    rows = tuple((f"{time:.1f}", kind, text) for time, kind, text in sorted(lines, key=lambda line: line[0])[:_MOST])
+    rows = tuple((f"{time:.1f}", kind, text) for time, kind, text in sorted(lines, key=lambda line: line[0])[:most])
     return Table("Events in order", ("time [s]", "what", "why"), rows)
 
 
@@ -243,15 +246,6 @@ def _begun(answer: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], int]]:
         if time in before and time not in answered:
             last[name, before[time]] = place
     return begun
-
-
-def _again(more: int) -> str:
-    return f" (and in {more} more window{'s' * (more > 1)})" if more else ""
-
-
-def _hidden(answer: Mapping[str, Any], story: Table) -> tuple[str, ...]:
-    more = 1 + len(_begun(answer)) + len(answer["actions"]) - len(story.rows)
-    return (f"{more} more in run.json.",) if more else ()
 
 
 def _regions(regions: Regions | None, truth: Mapping[str, Steps] | None) -> tuple[Picture, ...]:

@@ -1,29 +1,48 @@
-"""The whole drive at a glance: command, response, the simulator before and after, what did not count, the onset.
+"""Drawings of a drive: the whole of it, single manoeuvres, what is left of the gap, and what to drive next.
 
 Long drives are drawn by envelopes: of each short interval the least and the greatest value, so that no peak is lost.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.ticker import NullLocator
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
+from avtorch.experiment import Experiment
 from avtorch.gap.result.alarm import Alarm
 from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.manoeuvres import Manoeuvre
+from avtorch.gap.result.residuals import Residuals
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import Reason, Uncounted
-from avtorch.plots.diagnosis import budget_bar_count, budget_bars
-from avtorch.plots.style import BLACK, BLUE, GREY, PURPLE, VERMILLION, styled
+from avtorch.plots.diagnosis import budget_bars
+from avtorch.plots.style import (
+    BLACK,
+    BLUE,
+    GREY,
+    NARROW,
+    ORANGE,
+    PURPLE,
+    VERMILLION,
+    WIDE,
+    legend,
+    panels_of,
+    styled,
+)
 
-_WIDE, _NARROW = (8.6, 260), (4.0, 120)
-"""Width [in] and intervals of a line, on a desk and on a phone."""
+Against = Literal["command", "speed", "frequency", "earlier commands"]
+
+_INTERVALS = {False: 260, True: 120}
+"""Intervals of a line, on a desk and on a phone."""
+_SMALL = (4.0, 2.7)  # inches: as wide as a phone or half a desk's page
 _COLOURS = {
     "command": GREY,
     "measured": BLACK,
@@ -51,7 +70,7 @@ class DriveTime:
     Example:
         >>> from avtorch import Leader, diagnose, simulate
         >>> from avtorch.gap import DeadTime, plant
-        >>> from avtorch.plots.whole_drive import drive_time
+        >>> from avtorch.plots.drive import drive_time
         >>> late = plant([DeadTime(0.4)], sigma=0.0)
         >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
         >>> drive_time(diagnose(log, effects=["dead_time"], pairs=False)).begins
@@ -63,6 +82,11 @@ class DriveTime:
     uncounted: tuple[Uncounted, ...]
     onset: float | None
     alarms: tuple[Alarm, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """Of the axis."""
+        return "time [s]" if len(self.begins) == 1 else "time, one log behind the other [s]"
 
 
 def drive_time(found: Diagnosis) -> DriveTime:
@@ -95,7 +119,7 @@ def envelope(time: FloatArray, values: FloatArray, stretch: IntArray, intervals:
 
     Example:
         >>> import numpy as np
-        >>> from avtorch.plots.whole_drive import envelope
+        >>> from avtorch.plots.drive import envelope
         >>> time = np.arange(8.0)
         >>> envelope(time, np.array([0, 3, 1, 0, 0, 0, -2, 0.0]), np.zeros(8, int), 2)[1].tolist()
         [0.0, 3.0, 0.0, -2.0]
@@ -121,7 +145,7 @@ class DrivePanel:
 
     Example:
         >>> import numpy as np
-        >>> from avtorch.plots.whole_drive import DrivePanel
+        >>> from avtorch.plots.drive import DrivePanel
         >>> list(DrivePanel("speed [m/s]", {"measured": np.zeros(2)}).lines)
         ['measured']
     """
@@ -139,7 +163,7 @@ def drive_panels(found: Diagnosis) -> list[DrivePanel]:
     Example:
         >>> from avtorch import Leader, diagnose, simulate
         >>> from avtorch.gap import DeadTime, plant
-        >>> from avtorch.plots.whole_drive import drive_panels
+        >>> from avtorch.plots.drive import drive_panels
         >>> late = plant([DeadTime(0.4)], sigma=0.0)
         >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
         >>> [panel.label for panel in drive_panels(diagnose(log, effects=["dead_time"], pairs=False))]
@@ -173,8 +197,8 @@ def drive_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     A simulated speed begins at the measured one every ten seconds. Raises `InputError` where there are no traces.
     """
     panels = drive_panels(found)
-    width, _ = _NARROW if narrow else _WIDE
-    figure = Figure(figsize=(width, 0.8 + 1.9 * len(panels)), layout="constrained")
+    size = (NARROW if narrow else WIDE, 0.8 + 1.9 * len(panels))
+    figure = Figure(figsize=size, layout="constrained")
     _drive(figure, found, panels, narrow=narrow)
     return figure
 
@@ -197,8 +221,8 @@ def diagnosis_figure(found: Diagnosis) -> Figure:
     if found.budget is None:
         raise InputError("budget: the diagnosis has none to draw; its drives are too short to hold out blocks")
     panels = drive_panels(found)
-    heights = 0.7 + 0.3 * budget_bar_count(found.budget), 0.8 + 1.6 * len(panels)
-    figure = Figure(figsize=(_WIDE[0], sum(heights)), layout="constrained")
+    heights = 0.7 + 0.3 * max(len(found.budget.parts) + 1, 2), 0.8 + 1.6 * len(panels)
+    figure = Figure(figsize=(WIDE, sum(heights)), layout="constrained")
     parts = figure.add_gridspec(2, 1, height_ratios=heights)
     above, below = figure.add_subfigure(parts[0]), figure.add_subfigure(parts[1])
     budget_bars(above.add_subplot(), found.budget)
@@ -209,15 +233,12 @@ def diagnosis_figure(found: Diagnosis) -> Figure:
 def _drive(figure: FigureBase, found: Diagnosis, panels: list[DrivePanel], *, narrow: bool) -> None:
     axis, traces = drive_time(found), found.traces
     assert traces is not None
-    intervals = (_NARROW if narrow else _WIDE)[1]
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for ax, panel in zip(axes, panels, strict=True):
         _shade(ax, axis)
-        _channel(ax, axis, traces, panel, intervals)
-    axes[-1].set_xlabel("time [s]" if len(axis.begins) == 1 else "time, one log behind the other [s]")
-    axes[-1].set_xlim(float(axis.along[0]), float(axis.along[-1]))
-    handles = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(list(handles.values()), list(handles), loc="outside upper left", ncols=2 if narrow else 3)
+        _channel(ax, axis, traces, panel, _INTERVALS[narrow])
+    axes[-1].set(xlabel=axis.label, xlim=(float(axis.along[0]), float(axis.along[-1])))
+    legend(figure, axes, narrow=narrow, columns=3)
 
 
 def _shade(ax: Axes, axis: DriveTime) -> None:
@@ -246,3 +267,173 @@ def _channel(ax: Axes, axis: DriveTime, traces: Traces, panel: DrivePanel, inter
         low, high = float(measured.min()), float(measured.max())
         reach = _BEYOND * max(high - low, 1e-3)
         ax.set_ylim(low - reach, high + reach)
+
+
+# single manoeuvres --------------------------------------------------------------------------------------------------
+def manoeuvre_lines(ax: Axes, manoeuvre: Manoeuvre, traces: Traces) -> Axes:
+    """The accelerations of one manoeuvre over time, which is that of its log.
+
+    Example:
+        >>> import numpy as np
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.gap.result.manoeuvres import manoeuvres
+        >>> from avtorch.gap.result.traces import Traces
+        >>> from avtorch.plots.drive import manoeuvre_lines
+        >>> time = np.arange(0.0, 30.0, 0.05)
+        >>> u = np.where((time > 10) & (time < 15), -2.0, 0.0)
+        >>> traces = Traces(time, u, ("accel",), 0.9 * u[None], u[None], u[None], u, np.zeros(600, int))
+        >>> len(manoeuvre_lines(Figure().subplots(), manoeuvres(traces)[0], traces).lines)
+        4
+    """
+    time = traces.time[manoeuvre.rows]
+    for label, values in manoeuvre.lines.items():
+        ax.plot(time, values, color=_COLOURS[label], lw=1.2, label=label)
+    ax.set(xlabel="time [s]", ylabel="acceleration [m/s²]")
+    ax.margins(x=0)
+    return ax
+
+
+@styled
+def manoeuvre_figure(manoeuvre: Manoeuvre, traces: Traces) -> Figure:
+    """One manoeuvre, as wide as a phone or half a desk's page."""
+    figure = Figure(figsize=_SMALL, layout="constrained")
+    legend(figure, [manoeuvre_lines(figure.add_subplot(), manoeuvre, traces)], columns=2, fontsize=8)
+    return figure
+
+
+# what is left ------------------------------------------------------------------------------------------------------
+def residuals_of(found: Diagnosis) -> Residuals:
+    """The residuals of a diagnosis. Raises `InputError` where it has no traces.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, simulate
+        >>> from avtorch.gap import DeadTime, plant
+        >>> from avtorch.plots.drive import residuals_of
+        >>> late = plant([DeadTime(0.4)], sigma=0.0)
+        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
+        >>> left = residuals_of(diagnose(log, effects=["dead_time"], pairs=False))
+        >>> left.channel, bool(left.after.std() < left.before.std())
+        ('accel', True)
+    """
+    if found.traces is None:
+        raise InputError("traces: the diagnosis has none to draw")
+    return Residuals.of(found.traces)
+
+
+def sides(found: Diagnosis, left: Residuals) -> Mapping[str, FloatArray]:
+    """The residuals (row,) by label: without, and where something was named also with it."""
+    both = {"baseline simulator": left.before, "with what was named": left.after}
+    return both if found.winner.effects else {"baseline simulator": left.before}
+
+
+def residuals_against(ax: Axes, found: Diagnosis, axis: Literal["command", "speed"]) -> Axes:
+    """Means of the residual in bins of the command or the speed, with central 90 % intervals by blocks of the drive.
+
+    Raises `InputError` where there are no traces, or no speed.
+    """
+    left = residuals_of(found)
+    along = left.command if axis == "command" else left.speed
+    if along is None:
+        raise InputError("axis: found speed, needs a log in which it was measured")
+    for label, residual in sides(found, left).items():
+        bins = left.against(along, residual)
+        ax.fill_between(bins.place, bins.low, bins.high, color=_COLOURS[label], alpha=0.2, lw=0)
+        ax.plot(bins.place, bins.mean, "o-", color=_COLOURS[label], lw=1.2, ms=3, label=label)
+    ax.axhline(0.0, color=BLACK, lw=0.8)
+    ax.set(xlabel=f"{axis} [{'m/s²' if axis == 'command' else 'm/s'}]", ylabel="mean residual [m/s²]")
+    return ax
+
+
+def residual_spectrum(ax: Axes, found: Diagnosis) -> Axes:
+    """Power of the residual over frequency, with its central 90 %. Raises `InputError` where there are no traces."""
+    left = residuals_of(found)
+    for label, residual in sides(found, left).items():
+        spectrum = left.spectrum(residual)
+        if spectrum is not None:
+            # an interval of frequencies a point: a picture has no room for hundreds
+            few = np.unique(np.geomspace(1, len(spectrum.frequency), 60).astype(int)) - 1
+            f, power, low, high = (x[few] for x in (spectrum.frequency, spectrum.power, spectrum.low, spectrum.high))
+            ax.fill_between(f, low, high, color=_COLOURS[label], alpha=0.2, lw=0)
+            ax.plot(f, power, color=_COLOURS[label], lw=1.2, label=label)
+    ax.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="power [(m/s²)²/Hz]")
+    ax.margins(x=0)
+    for along in (ax.xaxis, ax.yaxis):
+        along.set_minor_locator(NullLocator())
+        along.set_major_formatter("{x:g}")
+    return ax
+
+
+def residual_correlation(ax: Axes, found: Diagnosis) -> Axes:
+    """Correlation of the residual with commands before it, and the band of 99 % for one that does not depend on them.
+
+    Raises `InputError` where there are no traces.
+    """
+    left = residuals_of(found)
+    band = 0.0
+    for label, residual in sides(found, left).items():
+        both = left.correlation(residual)
+        ax.plot(both.lag, both.value, color=_COLOURS[label], lw=1.2, label=label)
+        band = both.band
+    ax.axhspan(-band, band, color=GREY, alpha=0.25, lw=0, zorder=0)
+    ax.axhline(0.0, color=BLACK, lw=0.8)
+    ax.set(xlabel="time since the command [s]", ylabel="correlation [-]")
+    ax.margins(x=0)
+    return ax
+
+
+_DRAW: Mapping[Against, Callable[[Axes, Diagnosis], Axes]] = {
+    "command": lambda ax, found: residuals_against(ax, found, "command"),
+    "speed": lambda ax, found: residuals_against(ax, found, "speed"),
+    "frequency": residual_spectrum,
+    "earlier commands": residual_correlation,
+}
+
+
+@styled
+def residual_figure(found: Diagnosis, against: Against) -> Figure:
+    """One of the drawings above, as wide as a phone or half a desk's page."""
+    figure = Figure(figsize=_SMALL, layout="constrained")
+    legend(figure, [_DRAW[against](figure.add_subplot(), found)], columns=2, fontsize=8)
+    return figure
+
+
+@styled
+def residual_time_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
+    """The residual over the whole drive, and where 99 % of a steady one with the same quartiles would lie."""
+    left, axis = residuals_of(found), drive_time(found)
+    assert found.traces is not None
+    along = axis.along[
+        np.searchsorted(_rising(found.traces.time, found.traces.stretch), _rising(left.time, left.stretch))
+    ]
+    figure, (ax,) = panels_of(1, 2.6, narrow=narrow)
+    usual = 0.0
+    for label, residual in sides(found, left).items():
+        line = envelope(along, residual, left.stretch, _INTERVALS[narrow])
+        ax.plot(*line, color=_COLOURS[label], lw=0.9, label=label)
+        usual = left.usual(residual)
+    ax.axhspan(-usual, usual, color=GREY, alpha=0.25, lw=0, zorder=0)
+    ax.set(xlabel=axis.label, ylabel="residual [m/s²]", xlim=(float(axis.along[0]), float(axis.along[-1])))
+    legend(figure, [ax], narrow=narrow)
+    return figure
+
+
+def _rising(time: FloatArray, stretch: FloatArray | np.ndarray) -> FloatArray:
+    """A key of rows that rises over all stretches, of which several logs may have the same times."""
+    return stretch * 1e7 + time
+
+
+# what to drive next ------------------------------------------------------------------------------------------------
+@styled
+def experiment_figure(experiment: Experiment, *, narrow: bool = False) -> Figure:
+    """The command of the experiment to drive next, held between rows, over the speed that is expected of it."""
+    m = experiment.manoeuvre
+    figure = Figure(figsize=(NARROW, 4.2) if narrow else (WIDE, 4.0), layout="constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    top.axhline(0.0, color=GREY, lw=0.6)
+    top.step(m.time, m.command, where="post", color=BLUE)
+    top.set(ylabel="command [m/s²]")
+    top.set_title(m.name, loc="left")
+    bottom.plot(m.time, m.speed, color=ORANGE)
+    bottom.set(xlabel="time [s]", ylabel="expected speed [m/s]", ylim=(0, 1.15 * float(m.speed.max())))
+    bottom.margins(x=0)
+    return figure

@@ -1,4 +1,4 @@
-"""The tables of a diagnosis: budget, hypotheses, errors held out, places of the gap, the setting."""
+"""The tables of a diagnosis, for its page and the terminal."""
 
 from __future__ import annotations
 
@@ -20,20 +20,17 @@ _METRICS = {
 }
 
 _IMPLAUSIBLE = "physically implausible"
+_FAINT = 0.01  # hypotheses less probable than this are only counted
 
 
 def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
     """What each cause contributes to the gap, or without any what the error consists of; times count from `epoch_s`."""
     share = "share of the gap (90 %)" if budget.parts else "share of the error"
     columns = ("effect", share, "probability", "parameters (90 %)", "cannot be told from")
+    named = [(part, percent(part.share)) for part in budget.parts]
     rows = []
-    for part in budget.parts:
-        parameters = _parameters(part.parameters) + ([] if part.plausible else [_IMPLAUSIBLE])
-        alike = ", ".join(name for name in part.alias_set if name != part.name)
-        rows.append((part.name, percent(part.share), sentences.number(part.probability), "; ".join(parameters), alike))
-    for part in budget.chance:
+    for part, share in [*named, *((part, "by chance, part of the noise") for part in budget.chance)]:
         parameters = _parameters(part.parameters or {}) + ([] if part.plausible else [_IMPLAUSIBLE])
-        share = "by chance, part of the noise"
         alike = ", ".join(name for name in part.alias_set if name != part.name)
         rows.append((part.name, share, sentences.number(part.probability), "; ".join(parameters), alike))
     places, rest = budget.unexplained.places(epoch_s), budget.left_above_noise
@@ -48,14 +45,23 @@ def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
 
 
 def candidate_table(found: Diagnosis, most: int = 10) -> Table:
-    """The most probable hypotheses, the alias set in bold."""
-    some = found.candidates[:most]
+    """The most probable hypotheses, the alias set in bold; `none` and `unknown` always; the others are counted."""
+    ranked = found.candidates
+    always = [c for c in ranked if c.name in ("none", "unknown")]
+    best = [c for c in ranked if c not in always and (c is ranked[0] or c.probability >= _FAINT)][: most - len(always)]
+    shown = [c for c in ranked if c in best or c in always]
+    rows = [_candidate(c) for c in shown]
+    left = [c.probability for c in ranked if c not in shown]
+    if left:
+        rows.append((f"{len(left)} other{'s' * (len(left) > 1)}", sentences.number(sum(left)), "", ""))
+    marked = {i for i, c in enumerate(shown) if c.name in found.verdict.alias_set}
     return Table(
         "Hypotheses",
-        ("hypothesis", "probability", "nats over none", "parameters (90 %)"),
-        tuple(_candidate(c) for c in some),
-        numeric=("probability", "nats over none"),
-        marked={i for i, c in enumerate(some) if c.name in found.verdict.alias_set},
+        ("hypothesis", "probability", "nats", "parameters (90 %)"),
+        tuple(rows),
+        numeric=("probability", "nats"),
+        marked=marked,
+        soft=set(range(len(rows))) - marked,
     )
 
 
@@ -64,7 +70,7 @@ def _candidate(c: Any) -> tuple[str, str, str, str]:
     parameters = _parameters(c.parameters) if few else []
     parameters += [_IMPLAUSIBLE] if c.implausible and c.name != "unknown" else []
     name = c.name.replace("+", " + ") if few else f"these {len(c.effects)} effects"
-    nats = "" if c.log_evidence is None else f"{c.log_evidence:+.0f}"
+    nats = "" if c.log_evidence is None else f"{round(c.log_evidence):+d}" if round(c.log_evidence) else "0"
     return name, sentences.number(c.probability), nats, "; ".join(parameters)
 
 
@@ -118,25 +124,18 @@ def _peak(peak: Mapping[str, float | None]) -> str:
 
 
 def percent(q: Quantity) -> str:
-    """A share and its 90 % interval.
-
-    Example:
-        >>> from avtorch.gap.quantity import Quantity
-        >>> from avtorch.report.entries import percent
-        >>> percent(Quantity.of_normal(0.5, 0.1))
-        '50 % (34 to 66)'
-    """
+    """A share and its 90 % interval, as 50 % (34 to 66)."""
     low, high = (round(100 * x) for x in (q.q05, q.q95))
     return f"{budget_parts.percent(q.mean)} ({low} to {high})"
 
 
 def _parameters(parameters: Mapping[str, Quantity]) -> list[str]:
-    words = []
+    words, own = [], [key.rpartition(".")[2] for key in parameters]
     for key, q in parameters.items():
-        unit = unit_of(key)
-        words.append(f"{words_of(key.rpartition('.')[2])} {_number(q)}{'' if unit == '-' else ' ' + unit}")
+        effect, _, name = key.rpartition(".")
+        unit = unit_of(name)
+        # a pair's parameters need the effect's name only where both have one of that name
+        of = f"{effect}: " if own.count(name) > 1 else ""
+        interval = f"{q.mean:.3g} ({q.q05:.3g} to {q.q95:.3g})"
+        words.append(f"{of}{words_of(name)} {interval}{'' if unit == '-' else ' ' + unit}")
     return words
-
-
-def _number(q: Quantity, digits: int = 3) -> str:
-    return f"{q.mean:.{digits}g} ({q.q05:.{digits}g} to {q.q95:.{digits}g})"

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 from avtorch.errors import InputError
 from avtorch.io.clock import from_start
-from avtorch.plots.figures import belief_figure, probability_figure
-from avtorch.report.answer_page import AnswerPage, Section, Tone, answer_html, written
-from avtorch.report.estimates_sentences import dead_time_note, estimates_note, late_note, unexplained
+from avtorch.plots.time import belief_figure, probability_figure
 from avtorch.report.origin import Origin
-from avtorch.report.picture import Picture, picture_of
-from avtorch.report.window_table import alert_table, probability_table, window_table
+from avtorch.report.page import Page, Picture, Section, Tone, picture_of, written
+from avtorch.report.window_tables import alert_table, probability_table, window_table
 from avtorch.results import estimates_answer
 
 if TYPE_CHECKING:
+    from avtorch.decision.dead_time import InferredDeadTime
     from avtorch.decision.estimation import Estimates
     from avtorch.io import Log
+    from avtorch.logcheck.late_channel import LateChannel
 
 TARGET = 0.95
 """P(string stable) below which a setting is to be changed."""
@@ -49,7 +49,7 @@ def estimates_html(
     spread = answer["spread_over_sd"]
     told = (estimates_note(answer), *_stability(windows, answer["assumed"]))
     more = (late_note(found.late), dead_time_note(found.inferred))
-    page = AnswerPage(
+    page = Page(
         "Estimate",
         facts,
         Section(_headline(windows, spread), (*told, *(text for text in more if text)), (_belief(answer, log),)),
@@ -61,7 +61,7 @@ def estimates_html(
         ),
         _tone(windows, spread),
     )
-    return answer_html(page, origin=origin)
+    return page.html(origin)
 
 
 def write_estimates_page(
@@ -167,3 +167,59 @@ def _method(answer: Mapping[str, Any]) -> tuple[str, ...]:
         f"{assumed['accepted']['K_L']:g}, a car as it should be.",
     ]
     return (*found, answer["estimator_note"]) if answer["estimator_note"] else tuple(found)
+
+
+# sentences, for the terminal, too ---------------------------------------------------------------------------------
+UNEXPLAINED = 1.5
+"""`Estimates.spread_ratio` above which a single lag and gain do not describe the log."""
+
+
+def unexplained(spread_over_sd: Mapping[str, float | None]) -> bool:
+    """Whether estimates scatter by more than their intervals allow, from window to window."""
+    return any((x or 0.0) > UNEXPLAINED for x in spread_over_sd.values())
+
+
+def dead_time_note(inferred: InferredDeadTime | None) -> str:
+    """What the log says of the dead time, in one sentence; empty where it was not inferred."""
+    if inferred is None:
+        return ""
+    span = f"90 % of its probability from {inferred.q05:.2f} to {inferred.q95:.2f} s"
+    if inferred.seconds == 0.0:
+        return f"No dead time is clear ({span}): T_L holds it. --dead-time sets one."
+    return f"Dead time inferred, {inferred.seconds:.2f} s ({span}): T_L is the lag behind it. --dead-time sets another."
+
+
+def late_note(late: LateChannel | None) -> str:
+    """What was done about a late channel, in one sentence; empty where none is late."""
+    if late is None:
+        return ""
+    other = "speed" if late.name == "accel" else "accel"
+    done = f"{late.name} is moved by it" if late.recoverable else f"{late.name} is left out and {other} used alone"
+    return f"{late}: {done}. --no-align leaves both as they are."
+
+
+def estimates_note(answer: Mapping[str, Any]) -> str:
+    """Summarise a list of windows in one sentence."""
+    windows = answer["windows"]
+    excited, used = ([w for w in windows if w[key]] for key in ("excited", "used"))
+    if not excited:
+        longer = "use a longer --window" if len(windows) > 1 else "drive with more acceleration and braking"
+        return f"{len(windows)} windows, none excited: the belief is still the first prior; {longer}."
+    lost = len(excited) - len(used)
+    count = f"{len(excited)} of {len(windows)} windows excited"
+    if lost:
+        what = "their chains" if answer.get("estimator", "sgld") == "sgld" else "the estimates"
+        count += f", {lost} of them not used, as {what} did not converge"
+    if not used:
+        return f"{count}; the belief is still the first prior."
+    last = used[-1]
+    text = ", ".join(f"{name} {last[name]['mean']:.3f} ± {last[name]['sd']:.3f}" for name in ("T_L", "K_L"))
+    spread = [f"{name} {x:.1f}" for name, x in answer["spread_over_sd"].items() if x is not None]
+    more = f" Spread from window to window over posterior SD: {', '.join(spread)}." if spread else ""
+    if unexplained(answer["spread_over_sd"]):
+        more += " Lag and gain alone do not explain this log, or they changed: find the cause with avtorch diagnose."
+    elif all("accepted_change" in w["alerts"] for w in used):
+        more += (
+            " All of them differ from the accepted values: if the car is sound, pass its own with --accepted T_L,K_L."
+        )
+    return f"{count}; the last {'used' if lost else 'of them'} estimates {text}.{more}"

@@ -7,34 +7,26 @@ from typing import Any
 
 from avtorch.report.table import Table
 
+P_WORDS = "P: probability of string stability under the setting in force"
 MOST = 500
 """Windows that a table shows, evenly spaced: a day of them would make a page of megabytes."""
 
 
 def window_table(windows: Sequence[Mapping[str, Any]]) -> Table:
-    """A row a window, in the form of an answer: bounds [s], rows, T_L and K_L with 90 %, P(string stable), remarks.
-
-    Example:
-        >>> from avtorch.report.window_table import window_table
-        >>> belief = {"mean": 0.5, "q05": 0.4, "q95": 0.6}
-        >>> window = {"start_s": 0.0, "end_s": 2.0, "n": 200, "T_L": belief, "K_L": belief, "p_string_stable": 0.9}
-        >>> window_table([window | {"used": False, "excited": False, "alerts": []}]).rows
-        (('0 to 2', '200', '0.500 (0.40 to 0.60)', '0.500 (0.40 to 0.60)', '0.90', 'not excited'),)
-    """
-    columns = ("time [s]", "rows", "T_L [s] (90 %)", "K_L (90 %)", "P(string stable)", "remarks")
+    """A row a window, in the form of an answer: bounds [s], rows, T_L and K_L with 90 %, P(string stable), remarks."""
+    columns = ("time [s]", "rows", "T_L [s] (90 %)", "K_L (90 %)", "P", "remarks")
     step = _step(windows)
-    rows = tuple(_row(w) for w in windows[::step])
-    return Table(f"Lag and gain, {_which(step)}", columns, rows, numeric=("rows", "P(string stable)"))
+    shown = windows[::step]
+    rows = tuple(_row(w) for w in shown)
+    marked = [i for i, w in enumerate(shown) if w["alerts"]]
+    soft = [i for i, w in enumerate(shown) if not w["used"] and not w["alerts"]]
+    return Table(
+        f"Lag and gain, {_which(step)}; {P_WORDS}", columns, rows, numeric=("rows", "P"), marked=marked, soft=soft
+    )
 
 
 def probability_table(windows: Sequence[Mapping[str, Any]]) -> Table:
-    """P(string stable) when each window ended, and the alerts then.
-
-    Example:
-        >>> from avtorch.report.window_table import probability_table
-        >>> probability_table([{"end_s": 2.0, "p_string_stable": 0.9, "alerts": ["stability"]}]).rows
-        (('2', '0.90', 'stability'),)
-    """
+    """P(string stable) when each window ended, and the alerts then."""
     step = _step(windows)
     rows = tuple((_seconds(w["end_s"]), f"{w['p_string_stable']:.2f}", ", ".join(w["alerts"])) for w in windows[::step])
     columns = ("known at [s]", "P(string stable)", "alerts")
@@ -42,13 +34,7 @@ def probability_table(windows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def alert_table(alerts: Sequence[Mapping[str, Any]]) -> Table:
-    """The first alert of each detector, and how many windows raised it: one that nobody answers comes again.
-
-    Example:
-        >>> from avtorch.report.window_table import alert_table
-        >>> alert_table([{"time_s": t, "detector": "stability", "why": "P is 0.1"} for t in (2.0, 4.0)]).rows
-        (('2.0', 'stability', 'P is 0.1', '2'),)
-    """
+    """The first alert of each detector, and how many windows raised it: one that nobody answers comes again."""
     first: dict[str, Mapping[str, Any]] = {}
     for alert in alerts:
         first.setdefault(alert["detector"], alert)
@@ -69,7 +55,7 @@ def _which(step: int) -> str:
 
 
 def _row(w: Mapping[str, Any]) -> tuple[str, ...]:
-    own = [f"{w[n]['mean']:.3f} ({w[n]['q05']:.2f} to {w[n]['q95']:.2f})" for n in ("T_L", "K_L")]
+    own = [f"{w[n]['mean']:.3f} ({w[n]['q05']:.2f}-{w[n]['q95']:.2f})" for n in ("T_L", "K_L")]
     unused = "not converged" if w["excited"] else "not excited"
     remarks = ", ".join(w["alerts"]) if w["alerts"] else "" if w["used"] else unused
     span = f"{_seconds(w['start_s'])} to {_seconds(w['end_s'])}"

@@ -1,18 +1,19 @@
-"""The user's own simulator, as it is given on the command line: its output, columns of the log, or an object."""
+"""Simulators as they are given on the command line: effects or TOML, an object or FMU, its output, columns of a log."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from avtorch.cli.simulator import read_simulator
 from avtorch.errors import InputError, quoted
 
 if TYPE_CHECKING:
     from avtorch.external import ExternalSimulator
+    from avtorch.gap import GapPlant
     from avtorch.io import Log
 
 _CHANNELS = ("accel", "speed")
@@ -23,6 +24,30 @@ _OPTIONS = {
     "simulator": "--simulator",
 }
 """Options by how errors of what they hold begin."""
+
+
+def read_simulator(option: str, text: str) -> GapPlant | None:
+    """None for the bare GLVD, for which the answer also reports the gap that remains once a delay is modelled.
+
+    Raises `InputError` that names the `option`, for a file that is not there and for values out of range.
+    """
+    from avtorch.gap import plant
+
+    if text.strip().lower() == "glvd":
+        return None
+    given = f"{option} {quoted(text, 80)}"
+    if text.endswith(".toml") and not os.path.lexists(text):
+        raise InputError(f"{given}: no such file; needs a TOML file, or effects such as dead_time=0.2")
+    try:
+        simulator = plant(baseline=text)
+    except InputError as fault:
+        raise InputError(f"{given}: {fault}") from None
+    known = simulator.parameters()
+    for name, value in simulator.values().items():
+        # the ends of an interval are a drive's, which is not known yet
+        if known[name].constraint != "interval" and known[name].unconstrain(value).isnan().any():
+            raise InputError(f"{given}: {name} is {value.tolist():g}, needs a {known[name].constraint} number")
+    return simulator
 
 
 def simulator_of(
@@ -91,17 +116,18 @@ def simulators_of(
 
     Raises `InputError` for what cannot be read.
     """
-    found: list[ExternalSimulator | str] = []
+    found: list[ExternalSimulator | str | None] = []
     for text in simulator:
         if text.lower().endswith(".toml") or not (":" in text or text.lower().endswith(".fmu")):
             if read_simulator("--simulator", text) is None:
                 raise InputError("--simulator: found glvd, which would be fitted to the log; needs its T_L, as T_L=0.4")
             found.append(text)
         else:
-            found.append(_one((), text, step, path, drive))
+            found.append(simulator_of((), text, step, [(path, drive)]))
     if step is not None and all(isinstance(x, str) for x in found):
         raise InputError("--step: has a meaning with an object or an FMU as --simulator only")
-    return [*found, *(_one((text,), None, None, path, drive) for text in simulated)]
+    found += [simulator_of((text,), None, None, [(path, drive)]) for text in simulated]
+    return [x for x in found if x is not None]
 
 
 def _limits(adjust: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -117,14 +143,6 @@ def _limits(adjust: Sequence[str]) -> dict[str, tuple[float, float]]:
         if not equals or not colon or not name.strip():
             raise InputError(f"--adjust: found {quoted(text)}, needs NAME=LOW:HIGH, such as lag=0.1:1.0")
     return out
-
-
-def _one(
-    simulated: Sequence[str], simulator: str | None, step: float | None, path: Path, drive: Log
-) -> ExternalSimulator:
-    found = simulator_of(simulated, simulator, step, [(path, drive)])
-    assert found is not None
-    return found
 
 
 def _columns(prefix: str, path: Path, drive: Log) -> Log:

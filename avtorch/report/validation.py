@@ -1,0 +1,229 @@
+"""The page of a validation: does SGLD agree with exact quadrature and with NUTS?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avtorch.inference.units import shown_unit
+from avtorch.plots.chosen_windows import ChosenWindows
+from avtorch.plots.posterior_figures import validation_figures
+from avtorch.plots.ranks import rank_band
+from avtorch.plots.validation_ranks import ecdfs_of, ranks_of
+from avtorch.report.origin import Origin
+from avtorch.report.page import Page, Picture, Section, picture_of, written
+from avtorch.report.table import Table
+from avtorch.results import validation_answer
+from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE
+from avtorch.validation.validate import Validation
+
+_MOST = 40  # rows of the table behind a picture of all windows
+_TITLES = {
+    "agreement": "Window by window",
+    "marginals": "Marginals",
+    "joint": "Lag and gain together",
+    "ranks": "Ranks",
+    "ecdf": "Exact probabilities below the draws",
+}
+"""Of the sections, by picture, in their order."""
+_REFERENCES = {"nuts": "NUTS", "quadrature": "exact quadrature"}
+_SAYS = {
+    "agreement": "Dots, one a window: how far SGLD's mean and SD are from the reference's, over the width of the "
+    "posterior, with the limits asked for.",
+    "marginals": "Exact densities of each parameter with histograms of the draws of SGLD and of NUTS.",
+    "joint": "Clouds of SGLD's draws of lag and gain within the 50 and 90 % regions of the references.",
+    "ranks": "Bars of the ranks of groups of chains in the pool of all draws, within the band that chance explains.",
+    "ecdf": "Lines, one a window: the share of draws below each exact probability, less what it should be, with the "
+    "band that chance explains.",
+}
+
+
+def validation_html(found: Validation, *, origin: Origin | None = None) -> str:
+    """The page of a validation as text. Its clouds of draws are images within the page.
+
+    Example:
+        >>> from avtorch.inference import SamplerSettings
+        >>> from avtorch.report import validation_html
+        >>> from avtorch.validation import NutsSettings, synthetic_windows, validate
+        >>> quick = dict(settings=SamplerSettings(chains=64), nuts=NutsSettings(1, 20, 10), nuts_windows=1)
+        >>> "SGLD and exact quadrature" in validation_html(validate(synthetic_windows(1, seed=1), **quick))
+        True
+    """
+    answer = validation_answer(found)
+    summary = answer["summary"]
+    against = _REFERENCES[answer["reference"]]
+    word = "agree" if found.verdict.agree else "disagree"
+    page = Page(
+        "Validation",
+        f"{answer['source']} · {summary['windows']} windows",
+        Section(
+            f"SGLD and {against} {word}",
+            (answer["why"],),
+            tables=(validation_table(answer),),
+            items=validation_notes(answer),
+        ),
+        tuple(Section(_TITLES[name], pictures=(picture,)) for name, picture in _pictures(found).items()),
+        "green" if found.verdict.agree else "amber",
+    )
+    return page.html(origin)
+
+
+def write_validation_page(found: Validation, folder: str | PathLike[str], *, origin: Origin | None = None) -> Path:
+    """Write `validation.html` into `folder`; returns its path. Raises `InputError` where it cannot be written.
+
+    Example:
+        >>> from avtorch.inference import SamplerSettings
+        >>> from avtorch.report import write_validation_page
+        >>> from avtorch.validation import NutsSettings, synthetic_windows, validate
+        >>> quick = dict(settings=SamplerSettings(chains=64), nuts=NutsSettings(1, 20, 10), nuts_windows=1)
+        >>> write_validation_page(validate(synthetic_windows(1, seed=1), **quick), "out").name
+        'validation.html'
+    """
+    return written(validation_html(found, origin=origin), folder, "validation.html")
+
+
+def _pictures(found: Validation) -> dict[str, Picture]:
+    by_width = {narrow: validation_figures(found, narrow=narrow) for narrow in (False, True)}
+    tables = _tables_behind(found)
+    return {
+        name: picture_of(
+            name,
+            lambda narrow, name=name: by_width[narrow][f"{name}.png"](),
+            _SAYS[name],
+            tables[name],
+        )
+        for name in _TITLES
+        if f"{name}.png" in by_width[False]
+    }
+
+
+def validation_table(answer: Mapping[str, Any]) -> Table:
+    """A row a parameter: distance of SGLD from the reference over the windows; the last row has the aims."""
+    summary = answer["summary"]
+    exact = summary.get("coverage_90_quadrature")
+    columns = ["parameter", "mean error [SD]", "SD ratio", "W1 [SD]", "90 % covers", "ESS"]
+    if exact is not None:
+        columns.insert(5, "exact covers")
+    rows = []
+    for key in ("T_L", "K_L", "sigma"):
+        name = summary["sigma_is"] if key == "sigma" else key
+        cells = [
+            f"{name} [{shown_unit(name)}]",
+            f"{summary['mean_difference_sd_p95'][key]:.3f}",
+            f"{summary['sd_ratio_p025'][key]:.3f} to {summary['sd_ratio_p975'][key]:.3f}",
+            f"{summary['w1_sd_p95'][key]:.3f}",
+            f"{100 * summary['coverage_90'][key]:.1f} %",
+            f"{summary['ess_bulk_median'][key]:.0f}",
+        ]
+        if exact is not None:
+            cells.insert(5, f"{100 * exact[key]:.1f} %")
+        rows.append(tuple(cells))
+    rows.append(("aim", "0.100", "0.950 to 1.050", *("" for _ in columns[3:])))
+    return Table("SGLD against the reference", tuple(columns), tuple(rows), numeric=tuple(columns[1:]))
+
+
+def validation_notes(answer: Mapping[str, Any]) -> tuple[str, ...]:
+    """What the columns are, the number of windows they are over, and the time per window."""
+    summary, against = answer["summary"], _REFERENCES[answer["reference"]]
+    seconds = summary["seconds_per_window"]
+    run = ", ".join(f"{name} {seconds[name]:.2g} s" for name in seconds if name not in summary["not_run"])
+    truth = summary["coverage_is"] == "truth"
+    covers = "the share of windows whose interval covers the truth" if truth else "the interval's mass in the reference"
+    return (
+        f"Over {summary['compared']} windows against {against}: mean error and W1 (Wasserstein-1 distance) are 95 % "
+        f"quantiles, SD ratios the central 95 %; “90 % covers” is {covers}; ESS: effective sample size, the median.",
+        f"{summary['windows']} windows, {summary['excited']} excited, {summary['settled']} converged; one takes {run}.",
+        "Each window is estimated alone, under the first prior.",
+    )
+
+
+# behind the pictures ------------------------------------------------------------------------------------------------
+def _tables_behind(found: Validation) -> dict[str, Table]:
+    """By picture; the one of exact probabilities only where there is quadrature."""
+    chosen = ChosenWindows(found)
+    tables = {
+        "agreement": _windows(found),
+        "marginals": _marginals(chosen),
+        "joint": _correlations(chosen),
+        "ranks": _ranks(chosen),
+    }
+    if found.quadrature is not None:
+        tables["ecdf"] = _ecdfs(found)
+    return tables
+
+
+def _windows(found: Validation) -> Table:
+    """The windows farthest from the reference first, `_MOST` of them at most."""
+    columns = ("window", *(f"{what}, {n}" for what in ("mean error [SD]", "SD ratio") for n in found.names))
+    errors, ratios = (x.numpy() for x in (found.agreement.mean_difference, found.agreement.sd_ratio))
+    far = np.nan_to_num(np.maximum(abs(errors) / MEAN_TOLERANCE, abs(ratios - 1) / SD_TOLERANCE), nan=np.inf).max(1)
+    rows = tuple(
+        (str(int(found.compared[i])), *(f"{x:+.3f}" for x in errors[i]), *(f"{x:.3f}" for x in ratios[i]))
+        for i in np.argsort(-far, kind="stable")[:_MOST]
+    )
+    some = f"{len(rows)} of {len(errors)} windows" if len(rows) < len(errors) else "Windows"
+    return Table(f"{some}, the farthest from the reference first", columns, rows, numeric=columns[1:])
+
+
+def _marginals(chosen: ChosenWindows) -> Table:
+    found = chosen.validation
+    rows = []
+    for window in chosen.windows:
+        for i, name in enumerate(found.names):
+            exact, truth = found.quadrature, chosen.truth(window, name)
+            sides = (
+                None if exact is None else (exact.mean[window.number, i], exact.sd[window.number, i]),
+                (found.sgld.mean[window.number, i], found.sgld.sd[window.number, i]),
+                None if window.nuts is None else (found.nuts.mean[window.nuts, i], found.nuts.sd[window.nuts, i]),
+            )
+            told = ("" if side is None else f"{float(side[0]):.4g} ± {float(side[1]):.2g}" for side in sides)
+            rows.append(
+                (f"{window.number}: {name} [{shown_unit(name)}]", *told, "" if truth is None else f"{truth:.4g}")
+            )
+    columns = ("window and parameter", "exact", "SGLD", "NUTS", "truth")
+    return Table("Mean and SD", columns, tuple(rows))
+
+
+def _correlations(chosen: ChosenWindows) -> Table:
+    """Of T_L and K_L, by the draws."""
+    found = chosen.validation
+    pair = [found.names.index(name) for name in ("T_L", "K_L")]
+    rows = []
+    for i, window in enumerate(chosen.windows):
+        drawn = [None if chosen.exact is None else chosen.exact.flat[:, i], found.sgld.flat[:, window.number]]
+        drawn.append(None if window.nuts is None else found.nuts.flat[:, window.nuts])
+        told = ("" if x is None else f"{np.corrcoef(x[:, pair].numpy().T)[0, 1]:+.2f}" for x in drawn)
+        rows.append((str(window.number), *told))
+    columns = ("window", "exact", "SGLD", "NUTS")
+    return Table("Correlation of lag and gain", columns, tuple(rows), numeric=columns[1:])
+
+
+def _ranks(chosen: ChosenWindows) -> Table:
+    """A row a window and parameter: the bar of each group that is farthest from the count expected, and its band."""
+    rows, groups = [], ()
+    for row, window in enumerate(chosen.windows):
+        for name, ranks in zip(chosen.validation.names, ranks_of(chosen, row), strict=True):
+            groups, outside, cells = tuple(ranks.counts), 0, []
+            for group, (low, high) in rank_band(ranks.counts, effective=ranks.effective).items():
+                count = ranks.counts[group]
+                off = count * len(count) / count.sum() - 1
+                outside += int(((off < low) | (off > high)).sum())
+                cells.append(f"{100 * off[abs(off).argmax()]:+.0f} (±{50 * (high - low):.0f})")
+            rows.append((f"{window.number}: {name}", *cells, str(outside)))
+    columns = ("window and parameter", *groups, "bars outside")
+    return Table("Farthest bar and half width of its band [%]", columns, tuple(rows), numeric=columns[1:])
+
+
+def _ecdfs(found: Validation) -> Table:
+    rows = []
+    for arm in ecdfs_of(found):
+        far = abs(arm.less_uniform).max(-1)
+        for name, inside, reach in zip(found.names, arm.inside, far, strict=True):
+            where = (f"{reach.max():.3f}", str(int(arm.windows[reach.argmax()]))) if len(reach) else ("", "")
+            rows.append((f"{arm.method}: {name}", str(len(inside)), str(inside.sum()), *where))
+    columns = ("method and parameter", "windows", "inside their band", "farthest from uniform", "in window")
+    return Table("Windows within their 95 % bands", columns, tuple(rows), numeric=columns[1:])
