@@ -386,10 +386,9 @@ def _held_out(found: Diagnosis) -> str:
     scores = found.shrinkage
     assert scores is not None
     others = "the other drives" if scores.by_drives else "the other folds"
-    chosen = "" if scores.chosen is None else f" {100 * scores.chosen:.0f} % of the folds selected the verdict."
     return (
         f"Cross-validated on {scores.blocks} blocks of the drives: each is scored by a simulator selected and fitted "
-        f"on {others} alone.{chosen}"
+        f"on {others} alone."
     )
 
 
