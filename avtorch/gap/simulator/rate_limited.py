@@ -44,10 +44,11 @@ def _limited(
     start: FloatArray, parts: FloatArray, limit: FloatArray, slews: bool
 ) -> FloatArray:  # pragma: no cover - compiled
     """(column, time) of `parts` (part, 3, column, time): targets, lags and lengths."""
-    out = np.empty((parts.shape[2], parts.shape[3]))
-    for c in range(out.shape[0]):
+    _, _, columns, rows = parts.shape
+    out = np.empty((columns, rows))
+    for c in range(columns):
         state, J = start[c], limit[c]
-        for k in range(out.shape[1]):
+        for k in range(rows):
             for p in range(parts.shape[0]):
                 g, T, h = parts[p, 0, c, k], parts[p, 1, c, k], parts[p, 2, c, k]
                 d = g - state
