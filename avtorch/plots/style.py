@@ -144,12 +144,11 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Write a figure as PNG, whole or not at all.
 
-        Example:
-            >>> from matplotlib.axes import Axes
-    from matplotlib.figure import Figure, FigureBase
-            >>> from avtorch.plots import save
-            >>> save(Figure(figsize=(1, 1)), "empty.png").read_bytes()[1:4]
-            b'PNG'
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.plots import save
+        >>> save(Figure(figsize=(1, 1)), "empty.png").read_bytes()[1:4]
+        b'PNG'
     """
     picture = _png(figure)
     with atomic(path, binary=True) as stream:
@@ -160,14 +159,13 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
 def show(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Display a figure below the cell in a notebook; elsewhere save it at `path` and print the path.
 
-        Raises `InputError` where the file cannot be written.
+    Raises `InputError` where the file cannot be written.
 
-        Example:
-            >>> from matplotlib.axes import Axes
-    from matplotlib.figure import Figure, FigureBase
-            >>> from avtorch.plots import show
-            >>> show(Figure(figsize=(1, 1)), "empty.png")  # in a notebook the picture itself
-            picture: empty.png
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.plots import show
+        >>> show(Figure(figsize=(1, 1)), "empty.png")  # in a notebook the picture itself
+        picture: empty.png
     """
     display = notebook_display()
     if display is None:

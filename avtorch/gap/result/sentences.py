@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import Any, Protocol
 
-from avtorch.gap.answer.budget import listing
+from avtorch.gap.answer.budget import Budget, listing
+from avtorch.gap.answer.location import Location
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.free_form import FreeForm
+from avtorch.gap.result.gap_budget import Shrinkage
+from avtorch.gap.result.gap_size import GapSize
+from avtorch.gap.result.hypotheses import Candidate, Scope, Verdict
+from avtorch.gap.result.log_facts import LogFacts
+from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
 from avtorch.gap.simulator.effect import EFFECTS, named_cause
 from avtorch.io.clock import clock_words
-
-if TYPE_CHECKING:
-    from avtorch.gap.result.diagnosis import Diagnosis
-    from avtorch.gap.result.hypotheses import Scope
 
 SURE = 0.9
 """Probability from which a headline is unqualified."""
@@ -24,7 +29,48 @@ _MEASURES = {
 }
 
 
-def headline(found: Diagnosis) -> str:
+class Findings(Protocol):
+    """The input of the sentences; a `Diagnosis` has it."""
+
+    @property
+    def log(self) -> LogFacts: ...
+    @property
+    def baseline(self) -> Mapping[str, Quantity]: ...
+    @property
+    def gap(self) -> GapSize: ...
+    @property
+    def budget(self) -> Budget | None: ...
+    @property
+    def verdict(self) -> Verdict: ...
+    @property
+    def winner(self) -> Candidate: ...
+    @property
+    def onset_s(self) -> float | None: ...
+    @property
+    def onset_from_start_s(self) -> float | None: ...
+    @property
+    def onset_log(self) -> int: ...
+    @property
+    def where(self) -> tuple[Location, ...]: ...
+    @property
+    def shrinkage(self) -> Shrinkage | None: ...
+    @property
+    def remaining(self) -> tuple[Candidate, ...] | None: ...
+    @property
+    def next_experiment(self) -> Mapping[str, Any] | None: ...
+    @property
+    def setting(self) -> Mapping[str, Any] | None: ...
+    @property
+    def complete(self) -> bool: ...
+    @property
+    def scope(self) -> Scope | None: ...
+    @property
+    def tested(self) -> SimulatorUnderTest | None: ...
+    @property
+    def free_form(self) -> FreeForm | None: ...
+
+
+def headline(found: Findings) -> str:
     """The verdict as one sentence; provisional where the budget ended the search.
 
     It states an implausible fit; the winner's `implausible` gives the reasons.
@@ -32,7 +78,7 @@ def headline(found: Diagnosis) -> str:
     return _verdict(found) if found.complete else f"Provisional: {_verdict(found)}"
 
 
-def _verdict(found: Diagnosis) -> str:
+def _verdict(found: Findings) -> str:
     verdict, p = found.verdict, _share(found.winner.probability)
     if verdict.abstained and found.winner.probability < 0.5:
         return f"No cause can be named: perhaps it is not among the {_known(found)} ({p}), perhaps too weak to tell."
@@ -58,7 +104,7 @@ def _verdict(found: Diagnosis) -> str:
     return _lacks(found, p)
 
 
-def _lacks(found: Diagnosis, p: str) -> str:
+def _lacks(found: Findings, p: str) -> str:
     """That the simulator lacks the verdict's effects, `p` as words."""
     verdict, winner = found.verdict, found.winner
     who = "The" if winner.probability >= SURE else "Probably the" if winner.probability >= 0.5 else "Perhaps the"
@@ -72,7 +118,7 @@ def _lacks(found: Diagnosis, p: str) -> str:
     return f"{who} simulator lacks this ({p}): {', and '.join(causes)}."
 
 
-def _cause(found: Diagnosis, name: str) -> str:
+def _cause(found: Findings, name: str) -> str:
     """One of the verdict's effects in words, at the parameters of the budget or else of the fit."""
     parts = [] if found.budget is None else [*found.budget.parts, *found.budget.chance]
     of_budget = next((part.parameters for part in parts if part.name == name), None)
@@ -84,7 +130,7 @@ def _cause(found: Diagnosis, name: str) -> str:
     return named_cause(name, {key: q.mean for key, q in (of_budget or fitted).items()})
 
 
-def tested(found: Diagnosis) -> list[str]:
+def tested(found: Findings) -> list[str]:
     """What is said of a simulator that is not avtorch's own, beyond the headline."""
     facts = found.tested
     if facts is None:
@@ -111,7 +157,7 @@ def tested(found: Diagnosis) -> list[str]:
     return lines
 
 
-def budget(found: Diagnosis) -> list[str]:
+def budget(found: Findings) -> list[str]:
     """The sentence on the budget of the gap, and what it divides."""
     if found.budget is None or not found.budget.parts:
         return []
@@ -135,7 +181,7 @@ def budget(found: Diagnosis) -> list[str]:
     ]
 
 
-def onset(found: Diagnosis) -> list[str]:
+def onset(found: Findings) -> list[str]:
     """The sentence on the onset; with several causes one for each that sets in during the drive."""
     late = [] if found.budget is None else [p for p in found.budget.parts if p.onset_s is not None]
     if late and found.onset_s is None:
@@ -146,7 +192,7 @@ def onset(found: Diagnosis) -> list[str]:
     return ["The gap is there from the start."] if found.winner.effects else []
 
 
-def moment(found: Diagnosis) -> str:
+def moment(found: Findings) -> str:
     """The onset from the log's start, and in brackets on the log's own clock; one figure where both are the same."""
     assert found.onset_s is not None
     assert found.onset_from_start_s is not None
@@ -156,7 +202,7 @@ def moment(found: Diagnosis) -> str:
     return f"{found.onset_from_start_s:.1f} s from {of} start ({clock_words(round(found.onset_s, 1))})"
 
 
-def where(found: Diagnosis) -> list[str]:
+def where(found: Findings) -> list[str]:
     """Where the gap lies, apart from an onset."""
     places = []
     for part in found.where:
@@ -166,7 +212,7 @@ def where(found: Diagnosis) -> list[str]:
     return [f"The gap lies {', '.join(places)}."] if places else []
 
 
-def shrinkage(found: Diagnosis) -> list[str]:
+def shrinkage(found: Findings) -> list[str]:
     """How far the gap shrinks on held-out data; no second time where the budget's sentence has said so."""
     scores = found.shrinkage
     if scores is None:
@@ -192,7 +238,7 @@ def shrinkage(found: Diagnosis) -> list[str]:
     return [f"{line}; the {effect} {closes} {share} of the reducible gap."]
 
 
-def moved(found: Diagnosis) -> list[str]:
+def moved(found: Findings) -> list[str]:
     """The change of the baseline's fit by the effect."""
     baseline, with_it, changes = found.baseline, found.winner.moved, []
     for name in ("T_L", "K_L"):
@@ -203,7 +249,7 @@ def moved(found: Diagnosis) -> list[str]:
     return [f"Baseline fitted without and with the {effects}: {', '.join(changes)}."] if changes else []
 
 
-def aliases(found: Diagnosis) -> str:
+def aliases(found: Findings) -> str:
     """The hypotheses that the log cannot distinguish from the verdict."""
     from_words = {"none": "no effect at all", "unknown": "a cause outside the table"}
     if found.budget is not None and len(found.verdict.names) > 2:
@@ -236,16 +282,16 @@ def untried(scope: Scope) -> list[str]:
     return [f"Not tried: {listing(parts)}. Probabilities cover only what was tried; unknown stands for the rest."]
 
 
-def _cut(found: Diagnosis) -> bool:
+def _cut(found: Findings) -> bool:
     """Whether single effects were not tried."""
     return found.scope is not None and bool(found.scope.not_scored)
 
 
-def _all_tried(found: Diagnosis) -> bool:
+def _all_tried(found: Findings) -> bool:
     return found.complete and (found.scope is None or found.scope.whole)
 
 
-def _known(found: Diagnosis) -> str:
+def _known(found: Findings) -> str:
     """The set of effects that the sentence excludes."""
     if found.scope is None or _all_tried(found):
         return "effects known here"
@@ -255,7 +301,7 @@ def _known(found: Diagnosis) -> str:
     return f"{which} tried, {len(found.scope.scored)} of {len(found.scope.scored + found.scope.not_scored)}"
 
 
-def gap(found: Diagnosis) -> list[str]:
+def gap(found: Findings) -> list[str]:
     """The rollout errors of the baseline simulator."""
     gap = found.gap
     parts = []
@@ -282,7 +328,7 @@ def number(p: float) -> str:
     return "<.001" if 0 < p < 0.0005 else ">.999" if 0.9995 <= p < 1 else f"{p:.3f}"
 
 
-def remains(found: Diagnosis) -> list[str]:
+def remains(found: Findings) -> list[str]:
     """Hypotheses for what the simulator lacks besides the delay."""
     if not found.remaining:
         return []
@@ -291,7 +337,7 @@ def remains(found: Diagnosis) -> list[str]:
     return [f"Hypotheses once the simulator has dead_time: {each}."]
 
 
-def to_set(found: Diagnosis) -> list[str]:
+def to_set(found: Findings) -> list[str]:
     """The recommended setting."""
     if found.setting is None:
         return []
@@ -299,7 +345,7 @@ def to_set(found: Diagnosis) -> list[str]:
     return [why if why.startswith("Nothing to set") else f"To set: {why}"]
 
 
-def to_drive(found: Diagnosis) -> list[str]:
+def to_drive(found: Findings) -> list[str]:
     """The recommended next experiment."""
     experiment = found.next_experiment
     if experiment is None:
