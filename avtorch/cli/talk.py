@@ -8,7 +8,7 @@ import webbrowser
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
@@ -161,10 +161,14 @@ class Talk:
 def drawn(table: Table, most: int | None = None) -> Drawn:
     """A table of the page for the terminal, without the columns in which nothing stands."""
     shown = Drawn(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
-    kept = [i for i in range(len(table.columns)) if i == 0 or any(row[i] for row in table.rows)]
+    told = [i for i, title in enumerate(table.columns) if title not in table.page_only]
+    kept = [i for i in told if i == 0 or any(row[i] for row in table.rows)]
+    # a name is not cut, so that it can be copied
+    longest = max((len(word) for row in table.rows[:most] for word in row[0].split()), default=None)
     for i in kept:
         title = table.columns[i]
-        shown.add_column(escape(title), justify="right" if title in table.numeric else "left")
+        side: Literal["left", "right"] = "right" if title in table.numeric else "left"
+        shown.add_column(escape(title), justify=side, min_width=longest if i == 0 else None)
     for number, row in enumerate(table.rows[:most]):
         style = "bold" if number in table.marked else "dim" if number in table.soft else None
         shown.add_row(*(escape(printable(row[i])) for i in kept), style=style)

@@ -41,7 +41,7 @@ def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
             ("unexplained", budget_parts.percent(rest), "", places, ""),
             ("noise", budget_parts.percent(1.0 - rest), "", "", ""),
         ]
-    return Table("The gap's budget", columns, tuple(rows), numeric=("probability",))
+    return Table("The gap's budget", columns, tuple(rows), numeric=("probability",), page_only=columns[-1:])
 
 
 def candidate_table(found: Diagnosis, most: int = 10) -> Table:
@@ -124,9 +124,9 @@ def _peak(peak: Mapping[str, float | None]) -> str:
 
 
 def percent(q: Quantity) -> str:
-    """A share and its 90 % interval, as 50 % (34 to 66)."""
+    """A share and its 90 % interval, as 50 % (34 to 66); of whole per cents, as 100 %, where it has no width."""
     low, high = (round(100 * x) for x in (q.q05, q.q95))
-    return f"{budget_parts.percent(q.mean)} ({low} to {high})"
+    return budget_parts.percent(q.mean) + ("" if low == high else f" ({low} to {high})")
 
 
 def _parameters(parameters: Mapping[str, Quantity]) -> list[str]:

@@ -324,6 +324,7 @@ def test_table_fits_the_terminal(logs: list[Log], width: int) -> None:
     with console.capture() as seen:
         console.print(drawn(candidate_table(answer(logs))))
     assert max(len(line.rstrip()) for line in seen.get().splitlines()) <= width
+    assert all(name in seen.get().split() for name in ("dead_time", "unknown"))  # whole, to be copied
 
 
 def test_table_of_many_candidates_stays_short(logs: list[Log]) -> None:

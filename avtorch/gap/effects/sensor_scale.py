@@ -17,7 +17,8 @@ from avtorch.vehicle.arguments import Number, tensor
 class SensorScale(Effect):
     """The measured acceleration times `scale`; neutral at 1.
 
-    Possible are half to twice the true value; beyond that the unit is wrong.
+    A speed that reads 1 / `scale` of the truth (a wheel's radius) beside a right accelerometer is the same log, of a
+    car whose gain is K_L times `scale`. Possible are half to twice the true value; beyond that the unit is wrong.
 
     Example:
         >>> import torch
@@ -42,7 +43,8 @@ class SensorScale(Effect):
     @classmethod
     def in_words(cls, values: Mapping[str, float]) -> str:
         scale = values["scale"]
-        return f"the accelerometer shows {abs(100 * (scale - 1)):.2g} % too {'much' if scale > 1 else 'little'}"
+        more = "more" if scale > 1 else "less"
+        return f"the accelerometer shows {abs(100 * (scale - 1)):.2g} % {more} than the speed: one scale is wrong"
 
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         return tensor(self.scale) * x

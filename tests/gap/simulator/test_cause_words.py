@@ -40,7 +40,7 @@ def test_every_effect_brings_a_clause(kind: type[Effect]) -> None:
         ("gain_change", (1.4, 20.0), "the gain rises to 140 % during the drive"),
         ("sensor_bias", (0.25,), "the accelerometer reads 0.25 m/s² too high"),
         ("sensor_bias", (-0.25,), "the accelerometer reads 0.25 m/s² too low"),
-        ("sensor_scale", (0.8,), "the accelerometer shows 20 % too little"),
+        ("sensor_scale", (0.8,), "the accelerometer shows 20 % less than the speed: one scale is wrong"),
         ("speed_dependent_gain", (-0.2,), "commands do less the faster the car is"),
         ("speed_dependent_lag", (-0.2,), "the actuator is slower the slower the car is"),
         ("saturation", (1.5, float("-inf")), "the drive gives at most 1.5 m/s²"),
