@@ -31,7 +31,7 @@ SLOW = frozenset(
         "avtorch.follower.diagnose_follower.FollowerDiagnosis",
         "avtorch.follower.diagnose_follower.diagnose_follower",
         "avtorch.gap",
-        "avtorch.gap.diagnose.gap_budget",
+        "avtorch.gap.budget.gap_budget",
         "avtorch.gap.answer.budget.Budget",
         "avtorch.gap.compare.compare",
         "avtorch.gap.diagnose.diagnose",

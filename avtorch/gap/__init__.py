@@ -48,7 +48,7 @@ from avtorch.gap.simulator.recursion import scan, scan_pair
 from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
 
 if TYPE_CHECKING:
-    from avtorch.gap.diagnose import gap_budget
+    from avtorch.gap.budget import gap_budget
 
 __all__ = [
     "BASELINE",
@@ -105,7 +105,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """The engine is loaded when first used: its compiled code takes a second."""
     if name == "gap_budget":
-        from avtorch.gap.diagnose import gap_budget
+        from avtorch.gap.budget import gap_budget
 
         return gap_budget
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -13,7 +13,7 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.gap.answer.budget import MATERIAL, Budget
+from avtorch.gap.answer.budget import MATERIAL
 from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.coordinates import EFFECTS, adopt, base_name
@@ -261,34 +261,6 @@ def diagnose(
         parts=parts,
         free_form=None if free is None else free.form,
     )
-
-
-@shows_progress
-def gap_budget(
-    logs: LogSource | Sequence[LogSource],
-    *,
-    baseline: GapPlant | str | PathLike[str] | None = None,
-    effects: Sequence[str | type[Effect]] | None = None,
-    material: float = MATERIAL,
-    seed: int = 0,
-    progress: Callable[[str, int, int], None] | bool | None = None,
-) -> Budget:
-    """The budget of the gap between `baseline` (default: bare GLVD) and the car of these drives: that of `diagnose`.
-
-    Args: as of `diagnose`. Raises `InputError` as it does, and for drives too short to hold out five blocks.
-
-    Example:
-        >>> from avtorch import Leader, simulate
-        >>> from avtorch.gap import ConstantResistance, gap_budget, plant
-        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
-        >>> log = simulate(Leader.default(start=30.0, duration=60.0, dt=0.05), plant=dragging).log()
-        >>> gap_budget(log, effects=["constant_resistance", "dead_time"]).names
-        ('constant_resistance',)
-    """
-    found = diagnose(logs, baseline=baseline, effects=effects, material=material, seed=seed, progress=progress)
-    if found.budget is None:
-        raise InputError(f"{found.log.name}: {found.log.seconds:.0f} s are too short to hold out five blocks of 4 s")
-    return found.budget
 
 
 STEPS = 1000
