@@ -1,4 +1,4 @@
-"""The budget of the gap alone, as a call of its own, in a file of its own: a page of `diagnose` could not link to it."""
+"""The budget alone, as a call of its own and in a file of its own: pages of `diagnose` could not link to it."""
 
 from __future__ import annotations
 
