@@ -38,7 +38,8 @@ def _data(rng: np.random.Generator, seconds: float, noise: FloatArray) -> DriveD
     command = lfilter([np.sqrt(1 - c * c)], [1, -c], rng.normal(size=len(time)))
     lag = np.exp(-1 / (RATE_HZ * 0.3))
     accel = lfilter([0, 1 - lag], [1, -lag], command)
-    speed = 20.0 + np.cumsum(accel - accel.mean()) / RATE_HZ + 0.01 * rng.normal(size=len(time))
+    gained = np.cumsum(accel - accel.mean()) / RATE_HZ
+    speed = 5.0 - gained.min() + gained + 0.01 * rng.normal(size=len(time))  # never backwards, whatever the walk
     return DriveData.of(Log.from_arrays(time=time, accel_cmd=command, accel=accel + noise, speed=speed))
 
 
