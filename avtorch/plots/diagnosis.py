@@ -19,6 +19,7 @@ from avtorch.gap.answer.budget import HORIZON_S, LIKELY, Budget, percent
 from avtorch.gap.answer.location import UNITS, Axis
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Candidate, Diagnosis
+from avtorch.gap.result.traces import Traces
 from avtorch.io.clock import time_label
 from avtorch.plots.style import (
     BLACK,
@@ -114,6 +115,21 @@ class DriveStretch:
     lines: Mapping[str, FloatArray] = field(repr=False)
 
 
+def traces_of(found: Diagnosis) -> Traces:
+    """The traces of a diagnosis. Raises `InputError` where there are none.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, simulate
+        >>> from avtorch.plots.diagnosis import traces_of
+        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1)).log()
+        >>> traces_of(diagnose(log, effects=["dead_time"], pairs=False)).channels
+        ('accel', 'speed')
+    """
+    if found.traces is None:
+        raise InputError("traces: the diagnosis has none to draw")
+    return found.traces
+
+
 def stretch_of(found: Diagnosis, *, seconds: float = _SECONDS) -> DriveStretch:
     """What was measured, and what is simulated before and after the repair, where the effect does most.
 
@@ -128,9 +144,7 @@ def stretch_of(found: Diagnosis, *, seconds: float = _SECONDS) -> DriveStretch:
         >>> list(stretch_of(diagnose(log, effects=["dead_time"], pairs=False)).lines)
         ['measured', 'baseline simulator', 'with dead_time']
     """
-    traces = found.traces
-    if traces is None:
-        raise InputError("traces: the diagnosis has none to draw")
+    traces = traces_of(found)
     errors = [(traces.measured - x).std(-1) for x in (traces.before, traces.after)]
     shows = errors[0] / np.maximum(errors[1], 1e-12)
     # unlike the speed, the acceleration shows an event at its own time
@@ -209,9 +223,7 @@ def histogram_of(found: Diagnosis, axis: Axis, *, bins: int = 30) -> EffectHisto
         >>> round(float(counts.rows.sum()), 6), round(float(counts.effect.sum()), 6)
         (1.0, 1.0)
     """
-    traces = found.traces
-    if traces is None:
-        raise InputError("traces: the diagnosis has none to draw")
+    traces = traces_of(found)
     x = {"time": traces.time, "command": traces.command, "speed": traces.speed}.get(axis)
     if x is None:
         raise InputError(f"axis: found {axis!r}, needs time, command, or speed where it was measured")

@@ -23,7 +23,7 @@ from avtorch.gap.result.manoeuvres import Manoeuvre
 from avtorch.gap.result.residuals import Residuals
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import Reason, Uncounted
-from avtorch.plots.diagnosis import budget_bars
+from avtorch.plots.diagnosis import budget_bars, traces_of
 from avtorch.plots.style import (
     BLACK,
     BLUE,
@@ -91,9 +91,7 @@ class DriveTime:
 
 def drive_time(found: Diagnosis) -> DriveTime:
     """The axis of the whole drive. Raises `InputError` where there are no traces."""
-    traces = found.traces
-    if traces is None:
-        raise InputError("traces: the diagnosis has none to draw")
+    traces = traces_of(found)
     time, new = traces.time, np.flatnonzero(np.diff(traces.time) < 0) + 1
     number = np.zeros(len(time), int)
     number[new] = 1
@@ -169,9 +167,7 @@ def drive_panels(found: Diagnosis) -> list[DrivePanel]:
         >>> [panel.label for panel in drive_panels(diagnose(log, effects=["dead_time"], pairs=False))]
         ['acceleration [m/s²]', 'speed [m/s]']
     """
-    traces = found.traces
-    if traces is None:
-        raise InputError("traces: the diagnosis has none to draw")
+    traces = traces_of(found)
     panels = [] if "accel" in traces.channels else [DrivePanel("command [m/s²]", {"command": traces.command})]
     for name, measured, before, after in zip(
         traces.channels,
@@ -315,9 +311,7 @@ def residuals_of(found: Diagnosis) -> Residuals:
         >>> left.channel, bool(left.after.std() < left.before.std())
         ('accel', True)
     """
-    if found.traces is None:
-        raise InputError("traces: the diagnosis has none to draw")
-    return Residuals.of(found.traces)
+    return Residuals.of(traces_of(found))
 
 
 def sides(found: Diagnosis, left: Residuals) -> Mapping[str, FloatArray]:
