@@ -195,7 +195,7 @@ def simulate(  # pragma: no cover - compiled
         h = time[k + 1] - t
         # gears
         lost = 0.0
-        if q[_DEPTH] > 0.0:
+        if p[_DEPTH] > 0.0:  # gears change before an onset, too
             for g in range(gears):
                 s = shift_speeds[g]
                 if v > s and not above[g]:
@@ -235,7 +235,7 @@ def simulate(  # pragma: no cover - compiled
         if p[_STEP] != 0.0 and t + h > acts[_STEP]:
             begun = max(acts[_STEP], t - 1.0 - ramp)  # long ago is whole, and keeps its digits
             gain *= 1.0 + p[_STEP] * (_risen(t + h - begun, ramp) - _risen(t - begun, ramp)) / h
-        if lost > 0.0 and u2 > 0.0:
+        if q[_DEPTH] > 0.0 and lost > 0.0 and u2 > 0.0:
             gain *= 1.0 - q[_DEPTH] * lost
         before = a
         for part_number in range(2):

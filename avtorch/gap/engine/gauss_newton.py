@@ -167,9 +167,7 @@ def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05, names: Sequ
 
     Steps are shortened by damping until they gain; a coordinate that would leave its limits stays there and the others
     are solved again. A likelihood in a delay has creases, where commands arrive with a row: on one, no step gains, and
-    delays are held. Slopes are computed at the start, learn from each step (Broyden 1965, in the metric of the
-    information), and are computed again where a step by learned ones gains nothing or less than `tolerance` [nats]; the
-    fit ends where one by computed slopes does.
+    delays are held. Stops where a step gains less than `tolerance` [nats].
     """
     names = h.free if names is None else list(names)
     at = [INDEX[n] for n in names]
@@ -181,12 +179,8 @@ def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05, names: Sequ
     creased = np.array([n.endswith("_delay") or n == "dead_time" for n in names])
     creased = np.concatenate([creased, boundless < 0])
     held = np.zeros(len(creased), bool)
-    slopes, computed, steps = np.zeros(0), False, 0
-    while steps < iterations:
-        steps += 1
-        if not computed and not len(slopes):
-            slopes, computed = linearised(h, names)[0], True
-        precision, pull = linear_priors(h, names)
+    for _ in range(iterations):
+        slopes, precision, pull = linearised(h, names)
         W = whitened_under_noise(h, slopes, precision, 1)
         H = W @ W.T
         current = h.log_likelihood + penalty(h, names)
@@ -210,25 +204,14 @@ def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05, names: Sequ
             else:
                 damping = max(damping * 8, 1e-2)
         if better is None:
-            if computed:
-                break
-            slopes, steps, damping = np.zeros(0), steps - 1, 1e-3
-            held[:] = False
-            continue
+            break
         gain, current = value - current, value
-        step = np.concatenate([better.values[at] - h.values[at], better.force_coefficients - h.force_coefficients])
-        metric = np.diag(H) * step
-        missed = better.predicted - h.predicted - np.tensordot(step, slopes, 1)
-        slopes = slopes + np.multiply.outer(metric / max(float(metric @ step), 1e-30), missed)
         h.values, h.predicted, h.residual = better.values, better.predicted, better.residual
         h.force_coefficients = better.force_coefficients
         h.covariance, h.log_likelihood = better.covariance, better.log_likelihood
         damping = max(damping / 10, 1e-5)
-        if gain < tolerance and computed:
-            break
-        computed = False
         if gain < tolerance:
-            slopes = np.zeros(0)
+            break
     return h
 
 
