@@ -42,12 +42,12 @@ from avtorch.gap.engine.priors import (
 from avtorch.gap.engine.search import Search
 from avtorch.gap.engine.shape_error import log_prior, relative_size, shape_likelihood, shape_log_odds
 from avtorch.gap.engine.slow_forces import (
-    GustOnset,
     SlowForces,
+    SlowOnset,
     band_covariance,
-    gust_onset,
     pulling_lags,
     slow_forces,
+    slow_onset,
 )
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
@@ -67,7 +67,7 @@ class Composition:
 
     `nats` of the form over none; `relative`: size of what it does over the effects' response. `total` (slow force):
     evidence [nats] with process noise alone, a gust, or a road, errors of shape integrated out. `slow`: at the
-    likeliest error of shape. `gust_onset` [s] or None.
+    likeliest error of shape. `gust_onset`, `road_onset` [s] or None.
     """
 
     form: str
@@ -76,6 +76,7 @@ class Composition:
     total: Mapping[str, float]
     slow: SlowForces
     gust_onset: float | None = None
+    road_onset: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +177,7 @@ def examine(h: Hypothesis, search: Search) -> Examined:
     if not alone:  # with one channel no free form can be told from the base's own dynamics and slow force
         first = slow_forces(data, h.residual, _from_the_start(h), lags=lags)
         forms, mirror = _free_forms(h, search, first)
-        late = gust_onset(data, h.residual, first)
+        late = {kind: slow_onset(data, h.residual, first, kind) for kind in ("gust", "road")}
         compositions += [
             _composed(h, name, found.nats, found.residual, exact, lags, least=-6.0)
             for name, found in forms.items()
@@ -341,12 +342,17 @@ def _composed(
     return Composition(form, over, relative, {k: log_sum(v) for k, v in parts.items()}, best[1])
 
 
-def _set_in(c: Composition, late: GustOnset) -> Composition:
-    """The composition with a gust that sets in during the drive, where that gains more than one time is worth."""
-    if late.time is None:
-        return c
-    slow = replace(c.slow, gust_sd=late.sd, gust_time=late.correlation)
-    return replace(c, total={**c.total, "gust": c.total["gust"] + late.nats}, slow=slow, gust_onset=late.time)
+def _set_in(c: Composition, late: Mapping[str, SlowOnset]) -> Composition:
+    """The composition with a gust and a road that set in during the drive, where that gains more than a time is
+    worth."""
+    total, slow, gust, road = dict(c.total), c.slow, late["gust"], late["road"]
+    if gust.time is not None:
+        total["gust"] += gust.nats
+        slow = replace(slow, gust_sd=gust.sd, gust_time=gust.scale)
+    if road.time is not None:
+        total["road_grade"] += road.nats
+        slow = replace(slow, road_sd=road.sd, road_length=road.scale)
+    return replace(c, total=total, slow=slow, gust_onset=gust.time, road_onset=road.time)
 
 
 def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Weight]:

@@ -237,7 +237,8 @@ class _PulseLikelihood:
     """log L as a quadratic of pulses of the demand, other parameters being free.
 
     `score` (row,) is s~; `columns` (parameter, row) Z; `inverse` (parameter, parameter) N^-1; `information` (lag,) of
-    A and `cover` (row,) of D; `demand` (row,) [m/s²] the positive part of what drives the car; `since` [s] the effect acts.
+    A and `cover` (row,) of D; `demand` (row,) [m/s²] the positive part of what drives the car; `since` [s]: when the
+    effect sets in.
     """
 
     data: DriveData

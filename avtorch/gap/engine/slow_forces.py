@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -329,8 +329,7 @@ def slow_forces(
 
     gusts = gust_spectrum(frequency, GUST_TIME_GRID_S) @ energy.T
     gust, (g0, g1, g2) = best(gusts, GUST_SD_MPS2, _log_normal(GUST_TIME_GRID_S, GUST_TIME_S))
-    speed = max(float(data.smooth_speed.mean()), 2.0)
-    roads = road_spectrum(frequency, speed / ROAD_LENGTH_GRID_M) @ energy.T
+    roads = road_spectrum(frequency, _mean_speed(data) / ROAD_LENGTH_GRID_M) @ energy.T
     road, (_, r1, r2) = best(roads, ROAD_SD_MPS2, _log_normal(ROAD_LENGTH_GRID_M, ROAD_LENGTH_M))
     return SlowForces(
         log_likelihood=base,
@@ -351,33 +350,42 @@ def slow_forces(
     )
 
 
-class GustOnset(NamedTuple):
-    """A gust that sets in at `time` [s]: its `nats` over one that blows throughout, `sd` [m/s²] and `correlation` [s]
-    from then on; no nats and no time (None) where it does not."""
+class SlowOnset(NamedTuple):
+    """A gust or a road that sets in at `time` [s]: its `nats` over one that acts throughout, `sd` [m/s²] and `scale`, a
+    gust's correlation time [s] or a road's length [m], from then on; no nats and no time (None) where it does not."""
 
     nats: float
     time: float | None = None
     sd: float = 0.0
-    correlation: float = 0.0
+    scale: float = 0.0
 
 
-def gust_onset(data: DriveData, residual: FloatArray, found: SlowForces) -> GustOnset:
-    """When a gust sets in, if it does: between `ONSET_SHARES` of the frames, in drives of ten frames or more.
+def slow_onset(
+    data: DriveData, residual: FloatArray, found: SlowForces, kind: Literal["gust", "road"] = "gust"
+) -> SlowOnset:
+    """When a gust or a road sets in, if it does: between `ONSET_SHARES` of the frames, in drives of ten frames or more.
 
-    Process noise alone explains what was before, the same with a gust what comes after; `found` of the whole drive
+    Process noise alone explains what was before, the same with the force what comes after; `found` of the whole drive
     tells only the sensors, for over both parts a gust of half the time passes for process noise, or this for a gust.
     """
     frames = data.frame_count
     if frames < 10:
-        return GustOnset(0.0)
+        return SlowOnset(0.0)
     frequency, energy = band_response(data)
     unit = found.process_power / found.process_noise_beside_gust**2
     process = PROCESS_NOISE_GRID[:, None] ** 2 * unit
     of_process = _log_normal(PROCESS_NOISE_GRID, PROCESS_NOISE)
-    gust = SIZE_GRID_MPS2[:, None, None] ** 2 * (gust_spectrum(frequency, GUST_TIME_GRID_S) @ energy.T)
-    of_gust = _log_normal(SIZE_GRID_MPS2, GUST_SD_MPS2)[:, None] + _log_normal(GUST_TIME_GRID_S, GUST_TIME_S)
-    gust, of_gust = gust.reshape(-1, found.bands), of_gust.ravel()
-    whole, throughout = found.covariance, found.process_power + found.gust_power
+    if kind == "gust":
+        scales, of_size, of_scale = GUST_TIME_GRID_S, GUST_SD_MPS2, GUST_TIME_S
+        spectra, best = gust_spectrum(frequency, scales), (found.gust_sd, found.gust_time)
+    else:
+        scales, of_size, of_scale = ROAD_LENGTH_GRID_M, ROAD_SD_MPS2, ROAD_LENGTH_M
+        spectra, best = road_spectrum(frequency, _mean_speed(data) / scales), (found.road_sd, found.road_length)
+    shapes = spectra @ energy.T
+    force = (SIZE_GRID_MPS2[:, None, None] ** 2 * shapes).reshape(-1, found.bands)
+    of_force = (_log_normal(SIZE_GRID_MPS2, of_size)[:, None] + _log_normal(scales, of_scale)).ravel()
+    whole = found.covariance
+    throughout = found.process_power + best[0] ** 2 * shapes[int(np.abs(scales - best[1]).argmin())]
     if data.channel_count == 2:
         variances = wishart_profile(whole, found.counts, throughout)[1]
     else:
@@ -402,23 +410,27 @@ def gust_onset(data: DriveData, residual: FloatArray, found: SlowForces) -> Gust
     # at each cut the process noise that the first part shows, then both together at the best cut
     calm = nats(first[:, None], n[:, None], process) + of_process
     at = calm.argmax(1)
-    gains = calm.max(1) + (nats(second[:, None], m[:, None], process[at][:, None] + gust) + of_gust).max(1)
+    gains = calm.max(1) + (nats(second[:, None], m[:, None], process[at][:, None] + force) + of_force).max(1)
     cut = int(gains.argmax())
-    both = calm[cut][:, None] + nats(second[cut], m[cut], process[:, None] + gust) + of_gust
-    size, time = np.unravel_index(int(both.max(0).argmax()), (len(SIZE_GRID_MPS2), len(GUST_TIME_GRID_S)))
-    alike = np.array([found.process_noise_beside_gust]), np.array([found.gust_sd]), np.array([found.gust_time])
+    both = calm[cut][:, None] + nats(second[cut], m[cut], process[:, None] + force) + of_force
+    size, scale = np.unravel_index(int(both.max(0).argmax()), (len(SIZE_GRID_MPS2), len(scales)))
+    alike = [np.array([x]) for x in (found.process_noise_beside_gust, *best)]
     over = float(nats(whole, found.counts, throughout)) + sum(
-        float(_log_normal(x, prior)[0])
-        for x, prior in zip(alike, (PROCESS_NOISE, GUST_SD_MPS2, GUST_TIME_S), strict=True)
+        float(_log_normal(x, prior)[0]) for x, prior in zip(alike, (PROCESS_NOISE, of_size, of_scale), strict=True)
     )
     gain = float(both.max()) - over + math.log(ONSET_ODDS / len(cuts))  # one of so many frames
     if gain <= 0:
-        return GustOnset(0.0)
+        return SlowOnset(0.0)
     onset = float(data.frame_time[cuts[cut]] - 0.5 * data.hop_s)
-    return GustOnset(gain, onset, float(SIZE_GRID_MPS2[size]), float(GUST_TIME_GRID_S[time]))
+    return SlowOnset(gain, onset, float(SIZE_GRID_MPS2[size]), float(scales[scale]))
 
 
 # inside ---------------------------------------------------------------------------------------------------------------
+def _mean_speed(data: DriveData) -> float:
+    """[m/s] at which a road's wavelengths pass."""
+    return max(float(data.smooth_speed.mean()), 2.0)
+
+
 def _before_the_sensor(data: DriveData, values: FloatArray, bands: int) -> FloatArray:
     """Factors (band, channel, channel) of a covariance: what pushes the car passes the accelerometer's lag and scale.
 

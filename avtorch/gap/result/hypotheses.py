@@ -232,6 +232,8 @@ def onset_of(weight: Weight, name: str, logs: Sequence[Log]) -> Onset | None:
     time = next((t for e, t in h.onsets.items() if base_name(e) == name), None)
     if name == "gust" and weight.slow == "gust":
         time = weight.composition.gust_onset
+    elif name == "road_grade" and weight.slow == "road_grade":
+        time = weight.composition.road_onset
     elif name == "command_hold" and h.lost:
         time = _rate_onset(h, [i for i, _ in h.lost])
     elif name == "outliers" and weight.examined.outliers is not None:

@@ -19,12 +19,12 @@ from avtorch.gap.engine.slow_forces import (
     SIZE_GRID_MPS2,
     band_covariance,
     band_response,
-    gust_onset,
     gust_spectrum,
     process_spectrum,
     pulling_lags,
     road_spectrum,
     slow_forces,
+    slow_onset,
     wishart_log_likelihood,
     wishart_profile,
 )
@@ -215,7 +215,7 @@ def test_a_gust_that_sets_in_tells_when(channels: tuple[str, ...], rotating_seed
     onset = 330.0
     force = 0.4 * _ornstein_uhlenbeck(rng, len(data.time), 1.5) * (data.time > onset)
     residual = _residual(data, rng, force)
-    found = gust_onset(data, residual, slow_forces(data, residual, NEUTRAL))
+    found = slow_onset(data, residual, slow_forces(data, residual, NEUTRAL))
     assert found.nats > log_odds(data.frame_count)
     assert found.time is not None
     assert abs(found.time - onset) < 2 * data.hop_s  # a frame
@@ -230,7 +230,7 @@ def test_a_late_gust_over_strong_process_noise_tells_when(rotating_seed: int) ->
     force = _process_noise(rng, len(data.time), 0.16)
     force += 0.15 * _ornstein_uhlenbeck(rng, len(data.time), 1.4) * (data.time > 330.0)
     residual = _residual(data, rng, force)
-    found = gust_onset(data, residual, slow_forces(data, residual, NEUTRAL))
+    found = slow_onset(data, residual, slow_forces(data, residual, NEUTRAL))
     assert found.nats > log_odds(data.frame_count)
     assert found.time is not None
     assert abs(found.time - 330.0) < 4 * data.hop_s  # two frames
@@ -240,14 +240,27 @@ def test_a_late_gust_over_strong_process_noise_tells_when(rotating_seed: int) ->
 def test_a_gust_that_blows_throughout_has_no_onset(rotating_seed: int) -> None:
     rng, data = np.random.default_rng(rotating_seed), _data(600)
     residual = _residual(data, rng, 0.3 * _ornstein_uhlenbeck(rng, len(data.time), 1.5))
-    assert gust_onset(data, residual, slow_forces(data, residual, NEUTRAL)).nats < log_odds(3 * data.frame_count)
+    assert slow_onset(data, residual, slow_forces(data, residual, NEUTRAL)).nats < log_odds(3 * data.frame_count)
+
+
+@pytest.mark.statistical
+def test_a_road_that_rises_late_tells_when(rotating_seed: int) -> None:
+    rng, data = np.random.default_rng(rotating_seed), _data(900)
+    rows, f = len(data.time), np.fft.rfftfreq(len(data.time), 1 / RATE_HZ)
+    slope = np.fft.irfft(np.fft.rfft(rng.normal(size=rows)) * (f < SPEED_MPS / 420), rows)
+    residual = _residual(data, rng, 0.4 * slope / slope.std() * (data.time > 500.0))
+    found = slow_onset(data, residual, slow_forces(data, residual, NEUTRAL), "road")
+    assert found.nats > log_odds(data.frame_count)
+    assert found.time is not None
+    # a wave of it passes in half a minute, and may begin with little
+    assert abs(found.time - 500.0) < 40.0
 
 
 def test_short_drives_have_no_onset(fresh_seed: int) -> None:
     rng, data = np.random.default_rng(fresh_seed), _data(40)
     residual = _residual(data, rng, np.zeros(len(data.time)))
     assert data.frame_count < 10
-    assert gust_onset(data, residual, slow_forces(data, residual, NEUTRAL)).time is None
+    assert slow_onset(data, residual, slow_forces(data, residual, NEUTRAL)).time is None
 
 
 def test_what_is_given_replaces_the_residuals(fresh_seed: int) -> None:
