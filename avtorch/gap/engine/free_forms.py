@@ -147,11 +147,17 @@ def block(h: Hypothesis, form: FreeForm, iterations: int = 4) -> FreeFormFit:
             best, size = moves, sd
     taken = np.tensordot(best[known:], form.columns, 1)
     over, residual = 0.0, h.residual - taken - np.tensordot(best[:known], h.jacobian, 1)
-    if form.family == "dynamics":  # far from its place the response is no straight line in the parameters
-        there = _moved(h, best[: len(h.free)])
-        over = log_likelihood(h.data, residual)[0] - log_likelihood(h.data, there.residual - taken)[0]
-        residual = there.residual - taken
-    return FreeFormFit(log_sum(nats) - max(over, 0.0), residual, best[known:], size)
+    if form.family == "dynamics":
+        residual, over = _bent(h, best[:known], taken, residual)
+    return FreeFormFit(log_sum(nats) - over, residual, best[known:], size)
+
+
+def _bent(h: Hypothesis, moves: FloatArray, taken: FloatArray, linear: FloatArray) -> tuple[FloatArray, float]:
+    """What is left with the unknowns of `h` where they were moved and what a form has `taken`, and how many nats the
+    `linear` residual promised beyond that: far from its place the response is no straight line in the parameters."""
+    count = len(h.free)
+    left = _moved(h, moves[:count]).residual - taken - np.tensordot(moves[count:], h.jacobian[count:], 1)
+    return left, max(log_likelihood(h.data, linear)[0] - log_likelihood(h.data, left)[0], 0.0)
 
 
 def wandering(h: Hypothesis) -> dict[str, FreeFormFit]:
@@ -356,7 +362,7 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float, iterations: int =
     alone = np.asarray(np.linalg.solve(white @ white.T + np.diag(precision), score), np.float64)
     promised = max(gain(alone, h.residual - np.einsum("p,pcfk->cfk", alone, h.jacobian))[0], 0.0)
     noise, left = h.covariance, h.residual
-    best = FreeFormFit(-math.inf, None, np.zeros(frames))
+    best, moved = FreeFormFit(-math.inf, None, np.zeros(frames)), alone
     for _ in range(iterations):
         w, r, remaining = (by_frame(x, noise) for x in (response, h.residual, left))
         energy = (w * w).sum(1)
@@ -374,12 +380,15 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float, iterations: int =
         over, after = gain(moves, left)
         over += occam - math.log(len(priors)) - promised
         if over > best.nats:
-            best = FreeFormFit(over, left, course)
+            best, moved = FreeFormFit(over, left, course), moves
         change = np.log(np.trace(after, axis1=1, axis2=2) / np.trace(noise, axis1=1, axis2=2))
         if np.abs(change).max() < 0.05:  # of a band's variance: no nat in twenty coefficients
             break
         noise = after
-    return best
+    if best.residual is None or best.nats <= 0:
+        return best
+    left, over = _bent(h, moved, response * best.coefficients[:, None], best.residual)
+    return FreeFormFit(best.nats - over, left, best.coefficients)
 
 
 def _best_course(score: FloatArray, information: FloatArray, priors: Sequence[FloatArray]) -> tuple[FloatArray, float]:

@@ -96,6 +96,7 @@ class SlowForces:
     bands: int
     process_noise: float
     process_noise_beside_gust: float
+    process_noise_beside_road: float
     gust: float
     gust_sd: float
     gust_time: float
@@ -330,12 +331,13 @@ def slow_forces(
     gusts = gust_spectrum(frequency, GUST_TIME_GRID_S) @ energy.T
     gust, (g0, g1, g2) = best(gusts, GUST_SD_MPS2, _log_normal(GUST_TIME_GRID_S, GUST_TIME_S))
     roads = road_spectrum(frequency, _mean_speed(data) / ROAD_LENGTH_GRID_M) @ energy.T
-    road, (_, r1, r2) = best(roads, ROAD_SD_MPS2, _log_normal(ROAD_LENGTH_GRID_M, ROAD_LENGTH_M))
+    road, (r0, r1, r2) = best(roads, ROAD_SD_MPS2, _log_normal(ROAD_LENGTH_GRID_M, ROAD_LENGTH_M))
     return SlowForces(
         log_likelihood=base,
         bands=bands,
         process_noise=size,
         process_noise_beside_gust=float(sizes[g0]),
+        process_noise_beside_road=float(sizes[r0]),
         gust=gust,
         gust_sd=float(SIZE_GRID_MPS2[g1]),
         gust_time=float(GUST_TIME_GRID_S[g2]),
@@ -378,14 +380,16 @@ def slow_onset(
     if kind == "gust":
         scales, of_size, of_scale = GUST_TIME_GRID_S, GUST_SD_MPS2, GUST_TIME_S
         spectra, best = gust_spectrum(frequency, scales), (found.gust_sd, found.gust_time)
+        beside = found.process_noise_beside_gust
     else:
         scales, of_size, of_scale = ROAD_LENGTH_GRID_M, ROAD_SD_MPS2, ROAD_LENGTH_M
         spectra, best = road_spectrum(frequency, _mean_speed(data) / scales), (found.road_sd, found.road_length)
+        beside = found.process_noise_beside_road
     shapes = spectra @ energy.T
     force = (SIZE_GRID_MPS2[:, None, None] ** 2 * shapes).reshape(-1, found.bands)
     of_force = (_log_normal(SIZE_GRID_MPS2, of_size)[:, None] + _log_normal(scales, of_scale)).ravel()
     whole = found.covariance
-    throughout = found.process_power + best[0] ** 2 * shapes[int(np.abs(scales - best[1]).argmin())]
+    throughout = beside**2 * unit + best[0] ** 2 * shapes[int(np.abs(scales - best[1]).argmin())]
     if data.channel_count == 2:
         variances = wishart_profile(whole, found.counts, throughout)[1]
     else:
@@ -414,7 +418,7 @@ def slow_onset(
     cut = int(gains.argmax())
     both = calm[cut][:, None] + nats(second[cut], m[cut], process[:, None] + force) + of_force
     size, scale = np.unravel_index(int(both.max(0).argmax()), (len(SIZE_GRID_MPS2), len(scales)))
-    alike = [np.array([x]) for x in (found.process_noise_beside_gust, *best)]
+    alike = [np.array([x]) for x in (beside, *best)]
     over = float(nats(whole, found.counts, throughout)) + sum(
         float(_log_normal(x, prior)[0]) for x, prior in zip(alike, (PROCESS_NOISE, of_size, of_scale), strict=True)
     )

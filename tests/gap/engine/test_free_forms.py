@@ -18,6 +18,7 @@ from avtorch.gap.engine.free_forms import (
     COEFFICIENT_SD,
     TONE_HZ,
     FreeForm,
+    _bent,
     _between_bins,
     _first_order_backwards,
     _moved,
@@ -207,6 +208,18 @@ def test_what_dynamics_leave_is_left_by_a_car_within_its_limits() -> None:
     assert found.residual is not None
     left = log_likelihood(h.data, found.residual)[0] - h.log_likelihood
     assert found.nats <= left - 0.5 * float(found.coefficients @ found.coefficients) / COEFFICIENT_SD**2 + 1e-6
+
+
+@pytest.mark.parametrize("lag", [-3.0, -0.2, 0.6])
+def test_what_only_a_straight_line_promises_is_no_gain(lag: float) -> None:
+    """A course is found with parameters that move along straight lines, and counts where they put the car."""
+    h = _car(_lags)
+    moves = np.array([lag if name == "T_L" else 0.0 for name in h.free])
+    linear = h.residual - np.tensordot(moves, h.jacobian, 1)
+    left, over = _bent(h, moves, np.zeros_like(h.residual), linear)
+    car = _moved(h, moves)
+    np.testing.assert_allclose(left, h.data.measured - car.response())
+    assert over == pytest.approx(max(log_likelihood(h.data, linear)[0] - car.log_likelihood, 0.0))
 
 
 @pytest.mark.parametrize("channels", [("accel", "speed"), ("speed",), ("accel",)], ids="+".join)

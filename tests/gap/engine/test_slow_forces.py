@@ -244,6 +244,15 @@ def test_a_gust_that_blows_throughout_has_no_onset(rotating_seed: int) -> None:
 
 
 @pytest.mark.statistical
+def test_a_gust_that_blows_throughout_is_no_late_road(rotating_seed: int) -> None:
+    rng, data = np.random.default_rng(rotating_seed), _data(600)
+    residual = _residual(data, rng, 0.3 * _ornstein_uhlenbeck(rng, len(data.time), 1.5))
+    found = slow_forces(data, residual, NEUTRAL)
+    late = slow_onset(data, residual, found, "road")
+    assert found.road + late.nats < found.gust
+
+
+@pytest.mark.statistical
 def test_a_road_that_rises_late_tells_when(rotating_seed: int) -> None:
     rng, data = np.random.default_rng(rotating_seed), _data(900)
     rows, f = len(data.time), np.fft.rfftfreq(len(data.time), 1 / RATE_HZ)
