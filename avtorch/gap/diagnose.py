@@ -21,17 +21,20 @@ from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.evidence import evaluate_evidence
 from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.inference import RANDOM, Inference, infer
+from avtorch.gap.engine.priors import UNKNOWN_NATS
 from avtorch.gap.engine.sample import sample
 from avtorch.gap.result import sentences
-from avtorch.gap.result.attribution import RowAttribution, localise, row_attribution
+from avtorch.gap.result.attribution import RowAttribution, change_attribution, localise, row_attribution
 from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.result.diagnosis import Diagnosis, LogFacts
+from avtorch.gap.result.family_budget import families_of
 from avtorch.gap.result.free_form import fitted_form
 from avtorch.gap.result.free_runs import Blocks
 from avtorch.gap.result.gap_budget import budget_of, shrinkage_of
 from avtorch.gap.result.gap_size import Simulated, gap_size
 from avtorch.gap.result.held_out import held_out_errors, nested
 from avtorch.gap.result.hypotheses import (
+    ALIAS_RATIO,
     Scope,
     best_weight,
     candidates_of,
@@ -41,7 +44,7 @@ from avtorch.gap.result.hypotheses import (
     verdict_names,
 )
 from avtorch.gap.result.parameters import ParameterPosterior, base_quantities, own_random, renamed
-from avtorch.gap.result.parts import parts_of, said_of_unnamed
+from avtorch.gap.result.parts import parts_of, said_of_unnamed, unnamed_response
 from avtorch.gap.result.predictive_model import predictive_models
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import uncounted
@@ -210,8 +213,20 @@ def diagnose(
     said = verdict(average, names, known, partial=budget is not None and budget.partial)
     if not complete and "unknown" not in said.alias_set:  # which stands for what was not tried
         said = replace(said, alias_set=(*said.alias_set, "unknown"))
-    parts = parts_of(average, said.names, chosen, seed)
-    said = replace(said, why=" ".join(filter(None, (said.why, said_of_unnamed(parts)))))
+    bearer = average.best.get("unknown", weight) if said.names == ("unknown",) else weight
+    unnamed = unnamed_response(average, bearer, inference.search)
+    nameless = ()
+    if unnamed is not None:
+        change = change_attribution(rows, unnamed.hypothesis, unnamed.change, UNKNOWN_NATS)
+        nameless = localise(change, onset_s=None, lag=none["T_L"])
+    parts = parts_of(average, said.names, chosen, seed, unnamed, nameless)
+    if budget is not None and held is not None:
+        families = families_of(average, chosen, parts, held, free, among=tried_names(shown), seed=seed)
+        rest = replace(budget.unexplained, where=nameless, resembles=_resembles(average, said.names))
+        budget = replace(budget, families=families, unexplained=rest if rest.material else budget.unexplained)
+    said = replace(
+        said, why=" ".join(filter(None, (said.why, said_of_unnamed(parts, said.abstained, each[0].epoch_s))))
+    )
     if free is not None:
         sizes = free.form.sizes
         notes[_CARRIES.format(_FORMS[sizes.table > 0, sizes.resistance > 0])] = None
@@ -319,6 +334,13 @@ def _likeliest(average: ModelAverage) -> Weight:
     """The strongest weight of a label with names."""
     named = [w for label, w in average.best.items() if label not in ("none", "unknown")]
     return max(named or average.best.values(), key=lambda w: w.log_weight)
+
+
+def _resembles(average: ModelAverage, names: Sequence[str]) -> str | None:
+    """The likeliest effect that is not named."""
+    others = {n for label in average.probabilities for n in label.split("+")} - {"none", "unknown", *names}
+    likely = [n for n in others if average.marginal(n) >= ALIAS_RATIO]
+    return max(likely, key=lambda n: (average.marginal(n), n), default=None)
 
 
 def _without_map(weight: Weight) -> Weight:

@@ -72,7 +72,9 @@ def _bars_of(budget: Budget) -> list[tuple[str, Quantity, str]]:
     """Names, shares and colours."""
     if budget.parts:
         named = [(p.name, p.share, BLUE if p.probability >= LIKELY else SKY) for p in budget.parts]
-        return [*named, ("unexplained", budget.unexplained.share, ORANGE)]
+        rest = budget.unexplained
+        carried = [] if rest.carried is None else [("a force without a name", rest.carried, SKY)]
+        return [*named, *carried, ("unexplained", rest.beyond_carried, ORANGE)]
     rest = budget.left_above_noise
     both = (("unexplained", rest, ORANGE if budget.unexplained.material else SKY), ("noise", 1.0 - rest, GREY))
     return [(name, Quantity(share, 0.0, share, share), colour) for name, share, colour in both]

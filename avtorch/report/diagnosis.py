@@ -20,6 +20,7 @@ from avtorch.plots import drive
 from avtorch.report.diagnosis_tables import (
     budget_table,
     candidate_table,
+    family_table,
     measure_table,
     percent,
     place_table,
@@ -43,12 +44,12 @@ _NOT_COUNTED = {
     "settling": "pale, the first seconds of a drive and after a return",
 }
 _METHOD = (
-    "Each hypothesis is a whole simulator, rolled out over the drive from the logged commands. Its errors pass the "
-    "exact filter of a noise model that is fitted with it. The probabilities come from the evidence, calibrated on "
-    "simulated cars."
+    "Each hypothesis is a whole simulator and recorder, rolled out over the drive from the logged commands. Its errors "
+    "are compared in short frames and bands of frequency, in each of which the noise is free. The probabilities come "
+    "from the evidence, tempered on simulated cars."
 )
 _LIMITS = (
-    "One effect or two, out of a table; a cause outside it may be attributed to the nearest effect.",
+    "Effects out of a table, some at once; a cause outside it may be attributed to the nearest effect, or to two.",
     "On a real car trust the order of the hypotheses and the alias set, not the third digit.",
     "Stability is evaluated for small motions, at several speeds, with a linear controller.",
 )
@@ -83,6 +84,7 @@ def report_html(
     curves = _shrinkage(found)
     segments = f"{log.rows} rows in {log.segments} segment{'' if log.segments == 1 else 's'}"
     places = place_table(found)
+    families = None if found.budget is None else family_table(found.budget)
     page = Page(
         "Diagnosis",
         f"{log.name} · {log.seconds:.0f} s at {log.rate_hz:.3g} Hz",
@@ -100,7 +102,7 @@ def report_html(
                 tables=() if places is None else (places,),
                 soft=(*sentences.gap(found), *sentences.moved(found), *sentences.remains(found)),
             ),
-            Section("Which effect", pictures=(_which(found),)),
+            Section("Which effect", pictures=(_which(found),), tables=() if families is None else (families,)),
             _manoeuvres(found),
             residuals(found),
             Section("How far the gap shrinks")
@@ -173,12 +175,16 @@ def _budget(found: Diagnosis) -> Picture | None:
         return None
     rest, over = budget.left_above_noise, f"the squared error of {budget.horizon_s:.3g} s simulations"
     if budget.parts:
-        shares = [(part.name, part.share) for part in budget.parts] + [("unexplained", budget.unexplained.share)]
+        rest_of = budget.unexplained
+        shares = [(part.name, part.share) for part in budget.parts]
+        shares += [] if rest_of.carried is None else [("a force without a name", rest_of.carried)]
+        shares += [("unexplained", rest_of.beyond_carried)]
         told = ", ".join(f"{name} {100 * share.mean:.0f} %" for name, share in shares)
         says = f"Bars of what each effect contributes to the gap: {told}."
         caption = (
             f"A share is what an effect takes off {over}, above that of noise alone, on parts of the drive not used "
             "for fitting; effects are added in the order shown. Black lines: 90 % intervals."
+            + ("" if rest_of.carried is None else " The repaired simulator carries the force that has no name.")
         )
     else:
         says = (

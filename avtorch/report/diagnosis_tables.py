@@ -8,6 +8,7 @@ from typing import Any
 from avtorch.gap.answer import budget as budget_parts
 from avtorch.gap.answer.budget import Budget
 from avtorch.gap.answer.location import UNITS
+from avtorch.gap.engine.family import FORMS
 from avtorch.gap.quantity import unit_of, words_of
 from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis, Quantity, Shrinkage
@@ -35,13 +36,32 @@ def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
         rows.append((part.name, share, sentences.number(part.probability), "; ".join(parameters), alike))
     places, rest = budget.unexplained.places(epoch_s), budget.left_above_noise
     if budget.parts:
-        rows.append(("unexplained", percent(budget.unexplained.share), "", places, ""))
+        carried = budget.unexplained.carried
+        if carried is not None:
+            rows.append(("a force without a name", percent(carried), "", "in the repaired simulator", ""))
+        rows.append(("unexplained", percent(budget.unexplained.beyond_carried), "", places, ""))
     else:
         rows += [
             ("unexplained", budget_parts.percent(rest), "", places, ""),
             ("noise", budget_parts.percent(1.0 - rest), "", "", ""),
         ]
     return Table("The gap's budget", columns, tuple(rows), numeric=("probability",), page_only=columns[-1:])
+
+
+def family_table(budget: Budget) -> Table | None:
+    """What acts in each place of the car, whatever its name, and what could act there unseen; None without families."""
+    columns = ("family", "what", "size [m/s²] (90 %)", "takes off the gap (90 %)", "probability", "unseen up to [m/s²]")
+    rows = []
+    for one in budget.families:
+        unnamed = "" if one.form is None else f"without a name: {FORMS[one.form][1] if one.form in FORMS else one.form}"
+        size = "" if one.size_mps2 is None else interval_of(one.size_mps2)
+        off = "" if one.takes_off is None else percent(one.takes_off)
+        unseen = "" if one.unseen_mps2 is None else f"{one.unseen_mps2:.2g}{'' if one.excited else ', not excited'}"
+        what = "; ".join(filter(None, (", ".join(one.names), unnamed)))
+        rows.append((one.family, what, size, off, sentences.number(one.probability), unseen))
+    soft = {i for i, one in enumerate(budget.families) if not one.present}
+    caption = "The budget by families: each with everything else refitted without it, so that order changes nothing"
+    return Table(caption, columns, tuple(rows), numeric=columns[2:], soft=soft) if rows else None
 
 
 def candidate_table(found: Diagnosis, most: int = 10) -> Table:
@@ -127,6 +147,11 @@ def percent(q: Quantity) -> str:
     """A share and its 90 % interval, as 50 % (34 to 66); of whole per cents, as 100 %, where it has no width."""
     low, high = (round(100 * x) for x in (q.q05, q.q95))
     return budget_parts.percent(q.mean) + ("" if low == high else f" ({low} to {high})")
+
+
+def interval_of(q: Quantity) -> str:
+    """A number and its 90 % interval, where it has a width."""
+    return f"{q.mean:.2g}" + ("" if q.q05 == q.q95 else f" ({q.q05:.2g} to {q.q95:.2g})")
 
 
 def _parameters(parameters: Mapping[str, Quantity]) -> list[str]:

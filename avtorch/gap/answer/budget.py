@@ -96,6 +96,54 @@ class ChancePart:
 
 
 @dataclass(frozen=True)
+class FamilyShare:
+    """What acts in one place of the car, under whatever names: `names` of effects that the drives tell apart, and
+    `form` of a part without a name, None where there is none; `hidden`: names that may stand behind it.
+
+    `probability`: that something is there. `size_mps2`: root mean square of what it adds to the readings, over
+    resampled blocks of the drive. `takes_off`: share of the gap that held-out free runs lose by it, everything else
+    refitted without it; what two families can do alike is in neither. Both are None where nothing is likely.
+
+    `excited`: whether an effect of the family would have shown at its typical size. `unseen_mps2`: the root mean square
+    that the least visible of its effects could have without showing; None where only chance acts.
+
+    Example:
+        >>> from avtorch.gap.answer.budget import FamilyShare
+        >>> FamilyShare("time", probability=0.02, excited=True, unseen_mps2=0.04).to_dict()["unseen_mps2"]
+        0.04
+    """
+
+    family: str
+    names: tuple[str, ...] = ()
+    form: str | None = None
+    hidden: tuple[str, ...] = ()
+    probability: float = 0.0
+    size_mps2: Quantity | None = None
+    takes_off: Quantity | None = None
+    excited: bool = True
+    unseen_mps2: float | None = None
+
+    @property
+    def present(self) -> bool:
+        """Whether something of it is more likely there than not."""
+        return self.probability >= LIKELY
+
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `budget.families`."""
+        return {
+            "family": self.family,
+            "names": list(self.names),
+            "form": self.form,
+            "hidden": list(self.hidden),
+            "probability": self.probability,
+            "size_mps2": None if self.size_mps2 is None else _interval(self.size_mps2),
+            "takes_off": None if self.takes_off is None else _interval(self.takes_off),
+            "excited": self.excited,
+            "unseen_mps2": self.unseen_mps2,
+        }
+
+
+@dataclass(frozen=True)
 class Unexplained:
     """The share that is reproducible and that no cause explains.
 
@@ -120,11 +168,22 @@ class Unexplained:
     still: Quantity | None = None
     carried: Quantity | None = None
 
+    @property
+    def beyond_carried(self) -> Quantity:
+        """The share that the repaired simulator does not carry either."""
+        if self.carried is None:
+            return self.share
+        left = [max(x - y, 0.0) for x, y in ((self.share.q05, self.carried.q05), (self.share.q95, self.carried.q95))]
+        mean = max(self.share.mean - self.carried.mean, 0.0)
+        return Quantity(mean, self.share.sd, min(mean, *left), max(mean, *left))
+
     def rest(self, material: float) -> str:
         """What the error that is left is, in words: noise only where no black box could take off what matters."""
         if self.still is None or self.still.q95 < material:
             return "noise"
         low, high = (round(100 * x) for x in (self.still.q05, self.still.q95))
+        if low == 0 and high == 100:
+            return "noise or not: this log is too short to tell it from what a black box may still foretell"
         return f"noise but for {low} to {high} %, which a black box may still foretell"
 
     def places(self, epoch_s: float = 0.0) -> str:
@@ -199,6 +258,7 @@ class Budget:
     floor: float = 1.0
     horizon_s: float = HORIZON_S
     by_drives: bool = False
+    families: tuple[FamilyShare, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -228,9 +288,14 @@ class Budget:
     def __str__(self) -> str:
         """What a person reads first."""
         if not self.names:
+            carried, rest = self._carried(), self.unexplained.rest(self.material)
             if self.unexplained.material:
-                return f"No known effect explains the gap{self._by_the_plant(', but ')}."
-            rest = self.unexplained.rest(self.material)
+                but = f", but {carried} takes off {percent(self._takes_off)} of it" if carried else ""
+                return f"No known effect explains the gap{but}."
+            if carried:
+                return (
+                    f"No known effect is missing; {carried} takes off {percent(self._takes_off)} of what is foretold."
+                )
             return (
                 "Nothing material is missing."
                 if rest == "noise"
@@ -245,21 +310,29 @@ class Budget:
         return self._sentence(lead=f"That is {percent(self.parts[0].share.mean)} of the gap")
 
     def _sentence(self, lead: str) -> str:
+        """The named parts and the force without a name that the repaired simulator carries, the largest first, then
+        what is left."""
         named = [p for p in self.parts if p.probability >= LIKELY]
         large = [p for p in named if p.share.mean >= self.material] or named[:1]
         small = [_words(p) for p in named if p not in large]
-        words = [_words(p, f"{percent(p.share.mean)} of the gap") for p in large]
-        lines = [lead or f"Chiefly {', then '.join(words)}"] if words else []
+        shares = [(p.share.mean, _words(p, f"{percent(p.share.mean)} of the gap")) for p in large]
+        lines = []
+        if lead:
+            lines, shares = [lead], []
+        if self._carried() and (named or self.unexplained.material):
+            shares.append((self._takes_off, f"{self._carried()} ({percent(self._takes_off)} of the gap)"))
+        words = [said for _, said in sorted(shares, key=lambda x: -x[0])]
+        if words:
+            lines.append(f"{'' if lead else 'chiefly '}{', then '.join(words)}")
         if small:
             lines.append(f"{listing(small)} with under {percent(self.material)}{' each' if small[1:] else ''}")
-        rest = self.unexplained.share.mean
+        rest = self.unexplained.beyond_carried.mean
         if rest >= 0.005 and named:
-            plant = self._by_the_plant(": ")
-            if rest > max(p.share.mean for p in named) and not lead:
-                lines[0] = lines[0].replace("Chiefly ", "", 1)
-                lines.insert(0, f"chiefly no known effect explains it ({percent(rest)} of the gap{plant})")
+            if not lead and rest > max(share for share, _ in shares):
+                lines[0] = lines[0].replace("chiefly ", "", 1)
+                lines.insert(0, f"chiefly no known effect explains it ({percent(rest)} of the gap)")
             else:
-                lines.append(f"{percent(rest)} is reproducible and no known effect explains it{plant}")
+                lines.append(f"{percent(rest)} is reproducible and no known effect explains it")
         by_chance = [_words(c) for c in self.chance if c.probability >= LIKELY]
         noise = self.unexplained.rest(self.material)
         noise = noise if not by_chance else f"{noise}, in part this: {' and '.join(by_chance)}"
@@ -267,12 +340,14 @@ class Budget:
         text = "; ".join(lines) + "."
         return text[0].upper() + text[1:]
 
-    def _by_the_plant(self, before: str) -> str:
-        """What of the gap the repaired simulator takes off without a name; empty where that is nothing."""
-        carried = self.unexplained.carried
-        if carried is None or carried.mean < 0.005:
-            return ""
-        return f"{before}a force without a name in the repaired simulator takes off {percent(carried.mean)}"
+    @property
+    def _takes_off(self) -> float:
+        """What of the gap the repaired simulator takes off without a name."""
+        return 0.0 if self.unexplained.carried is None else self.unexplained.carried.mean
+
+    def _carried(self) -> str:
+        """The force without a name in the repaired simulator in words; empty where it does nothing."""
+        return "a force of command and speed without a name" if self._takes_off >= 0.005 else ""
 
     def to_dict(self) -> dict[str, Any]:
         """The object `budget` of `diagnosis.json`."""
@@ -286,6 +361,7 @@ class Budget:
             "by_channel": {name: error.to_dict() for name, error in self.by_channel.items()},
             "parts": [part.to_dict() for part in self.parts],
             "chance": [part.to_dict() for part in self.chance],
+            "families": [family.to_dict() for family in self.families],
             "unexplained": self.unexplained.to_dict(),
             "material": self.material,
         }

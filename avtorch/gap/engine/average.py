@@ -17,10 +17,13 @@ import itertools
 import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name
+from avtorch.gap.engine.family import family_of
 from avtorch.gap.engine.free_forms import FreeFormFit, block, families, mirror_columns, tone, wandering
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import log_sum
@@ -53,6 +56,7 @@ _LINEAR = frozenset({"dead_time", "second_order_actuator", "sensor_lag", "drivel
 _FAINT_GUST = FAINT_OF_RANGE * TABLE["gust"].parameters[0].low
 _LARGE_OF_COMMAND = 0.2  # a slow force has a name, with one channel, from this share of the command's spread on
 _LEAST_LISTED = 1e-4
+Key = TypeVar("Key", str, frozenset[str])
 
 SLOW = ("none", "gust", "road_grade")
 
@@ -95,7 +99,8 @@ class Examined:
 class Weight:
     """One composition under one label: `log_weight` [nats] before tempering, `evidence` the same without odds.
 
-    `part`: the free form that is a part without a name; empty where there is none, or where it is an error of shape.
+    `part`: the free form that is a part without a name, or a cause without one; empty where there is none, or where it
+    is an error of shape.
     """
 
     label: str
@@ -106,6 +111,13 @@ class Weight:
     slow: str
     outliers: bool
     part: str = ""
+
+    @property
+    def families(self) -> frozenset[str]:
+        """Of what is there under this label."""
+        names = [n for n in self.label.split("+") if n not in ("none", "unknown")]
+        names += [self.part] if self.part else []
+        return frozenset([*map(family_of, names), *(["force map"] if self.examined.hypothesis.force else [])])
 
     @property
     def process_noise(self) -> float:
@@ -120,7 +132,7 @@ class ModelAverage:
 
     `probabilities` sum to 1, the most probable first; `best`: the strongest support of each label. `force_maps`:
     probability of each form of a force map in the base, by its name; `parts`: of each free form as a part without a
-    name.
+    name, or as what `unknown` stands for; `families`: that something of a family is there, with a name or without.
     """
 
     probabilities: Mapping[str, float]
@@ -128,6 +140,7 @@ class ModelAverage:
     examined: tuple[Examined, ...]
     force_maps: Mapping[str, float] = field(default_factory=dict)
     parts: Mapping[str, float] = field(default_factory=dict)
+    families: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
@@ -198,6 +211,15 @@ def _free_forms(h: Hypothesis, search: Search, slow: SlowForces) -> tuple[dict[s
     return forms, mirror
 
 
+def free_form_response(x: Examined, search: Search, form: str) -> FloatArray | None:
+    """What a free form explains of the residual beside a hypothesis, with all parameters moved again: coefficients
+    (channel, frame, bin); None where it tells nothing."""
+    h = x.hypothesis
+    forms, _ = _free_forms(h, search, slow_forces(h.data, h.residual, _from_the_start(h), lags=pulling_lags(h)))
+    left = forms[form].residual if form in forms else None
+    return None if left is None else h.residual - left
+
+
 def average(
     examined: list[Examined],
     *,
@@ -224,12 +246,14 @@ def average(
     best: dict[str, Weight] = {}
     bases: dict[str, list[float]] = {}
     forms: dict[str, list[float]] = {}
+    families: dict[frozenset[str], list[float]] = {}
     for w in weights:
         given = _given(w.label, prior or {})
         total.setdefault(w.label, []).append(TEMPER * w.log_weight + given)
         force = w.examined.hypothesis.force
         bases.setdefault("" if force is None else force.name, []).append(total[w.label][-1])
         forms.setdefault(w.part, []).append(total[w.label][-1])
+        families.setdefault(w.families, []).append(total[w.label][-1])
         if w.label not in best or best[w.label].log_weight < w.log_weight:
             best[w.label] = w
     logs = {label: log_sum(x) if x else -np.inf for label, x in total.items()}
@@ -241,7 +265,9 @@ def average(
     whole = sum(listed.values())
     ordered = sorted(listed.items(), key=lambda kv: -kv[1])
     chances = {k: v / whole for k, v in ordered}
-    return ModelAverage(chances, best, tuple(examined), _shares(bases), _shares(forms))
+    together = _shares(families)
+    each = {name: sum(p for own, p in together.items() if name in own) for own in together for name in own}
+    return ModelAverage(chances, best, tuple(examined), _shares(bases), _shares(forms), each)
 
 
 # inside ---------------------------------------------------------------------------------------------------------------
@@ -251,8 +277,8 @@ def _renamed(w: Weight, nameless: Collection[str]) -> str:
     return left or ("none" if w.examined.hypothesis.force is None else "unknown")
 
 
-def _shares(logs: Mapping[str, list[float]]) -> dict[str, float]:
-    """Probabilities of what has a name, from logarithms of weights by name."""
+def _shares(logs: Mapping[Key, list[float]]) -> dict[Key, float]:
+    """Probabilities of what is not empty, from logarithms of weights by what they have."""
     each = {name: log_sum(x) for name, x in logs.items()}
     whole = log_sum(list(each.values()))
     return {name: math.exp(x - whole) for name, x in each.items() if name}
@@ -358,7 +384,7 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
             kinds = ("gust",) if large and total["gust"] > total["none"] + SLOW_FORCE_NATS else ("none",)
             total["none"] = max(total["none"], total["gust"] - SLOW_FORCE_NATS)
         for slow, (number, (label, worth)) in itertools.product(kinds, enumerate(labels)):
-            part = c.form if number == 0 else ""
+            part = c.form if number == 0 or label is None else ""
             value = odds + worth
             if slow != "none":
                 sd = c.slow.gust_sd if slow == "gust" else c.slow.road_sd

@@ -137,15 +137,18 @@ def simulate(  # pragma: no cover - compiled
     r00 = r01 = r10 = r11 = f00 = f01 = f10 = f11 = 0.0
     ring_h = -1.0
     s_keep = s_old = s_new = s_h = s_lag = -1.0
-    onset_any = False
-    for j in range(_COUNT):
-        if acts[j] > time[0]:
-            onset_any = True
+    m_square = until = -1.0
+    jerk_limit = slower = brake_gain = brake_lag = 1.0
     for k in range(n):
         t, v = time[k], max(speed[k], 0.0)
-        if onset_any:
+        if k == 0 or starts[k] or t >= until:  # what acts changes at onsets alone
+            until = 1e300
             for j in range(_COUNT):
                 q[j] = p[j] if t >= acts[j] else _NEUTRAL[j]
+                if acts[j] > t:
+                    until = min(until, acts[j])
+            jerk_limit = 1.0 / q[_JERK] if q[_JERK] > 1e-9 else 1e9
+            slower, brake_gain, brake_lag = math.exp(q[_LAG_RATIO]), math.exp(q[_BRAKE_GAIN]), math.exp(q[_BRAKE_LAG])
         # body forces at this row
         air = v + p[_WIND]
         outer = -q[_DRAG] * air * abs(air)
@@ -192,7 +195,7 @@ def simulate(  # pragma: no cover - compiled
         h = time[k + 1] - t
         # gears
         lost = 0.0
-        if q[_DEPTH] > 0.0:
+        if p[_DEPTH] > 0.0:  # gears change before an onset, too
             for g in range(gears):
                 s = shift_speeds[g]
                 if v > s and not above[g]:
@@ -228,24 +231,22 @@ def simulate(  # pragma: no cover - compiled
             gain *= max(1.0 + q[_GAIN_SLOPE] * (v / reference_speed - 1.0), _LEAST_FACTOR)
         if q[_LAG_SLOPE] != 0.0:
             lag *= max(1.0 + q[_LAG_SLOPE] * (v / reference_speed - 1.0), _LEAST_FACTOR)
-        if q[_LAG_RATIO] != 0.0:
-            lag *= math.exp(q[_LAG_RATIO])
+        lag *= slower
         if p[_STEP] != 0.0 and t + h > acts[_STEP]:
             begun = max(acts[_STEP], t - 1.0 - ramp)  # long ago is whole, and keeps its digits
             gain *= 1.0 + p[_STEP] * (_risen(t + h - begun, ramp) - _risen(t - begun, ramp)) / h
-        if lost > 0.0 and u2 > 0.0:
+        if q[_DEPTH] > 0.0 and lost > 0.0 and u2 > 0.0:
             gain *= 1.0 - q[_DEPTH] * lost
         before = a
-        jerk_limit = 1.0 / q[_JERK] if q[_JERK] > 1e-9 else 1e9
         for part_number in range(2):
             c = u1 if part_number == 0 else u2
             length = h1 if part_number == 0 else h - h1
             if length <= 0.0:
                 continue
             target, T = gain * c, lag
-            if c < 0.0 and (q[_BRAKE_GAIN] != 0.0 or q[_BRAKE_LAG] != 0.0):
-                target *= math.exp(q[_BRAKE_GAIN])
-                T *= math.exp(q[_BRAKE_LAG])
+            if c < 0.0:
+                target *= brake_gain
+                T *= brake_lag
             if q[_SQUARE] > 0.0:
                 if q[_JERK] > 1e-9:
                     d = target - slewed
@@ -254,9 +255,9 @@ def simulate(  # pragma: no cover - compiled
                     missed = moving * 0.5 * (d + target - after) + (length - moving) * (target - after)
                     slewed = after
                     target -= missed / length
-                if m_T != T or length != m_h or onset_any:
+                if m_T != T or length != m_h or m_square != q[_SQUARE]:
                     m00, m01, m10, m11 = modes(q[_SQUARE], T, length)
-                    m_T, m_h = T, length
+                    m_T, m_h, m_square = T, length, q[_SQUARE]
                 d = a - target
                 after, swing = target + m00 * d + m01 * w, m10 * d + m11 * w
                 v_gained += target * length - T * (after - a) - (swing - w)

@@ -243,7 +243,7 @@ EFFECTS: dict[str, EngineEffect] = {
                 _nuisance("shift_duration", "duration_s", 0.35, 0.2, 0.06, 2.5),
             ),
             ((0.6, 0.35), (0.9, 0.7)),
-            "never",
+            "may",
             _SPEED,
         ),
         EngineEffect(

@@ -226,8 +226,10 @@ class DriveData:
 
     @property
     def window(self) -> FloatArray:
-        M = self.frame_rows
-        return np.sin(np.pi * (np.arange(2 * M) + 0.5) / (2 * M))
+        if "window" not in self.cache:
+            M = self.frame_rows
+            self.cache["window"] = np.sin(np.pi * (np.arange(2 * M) + 0.5) / (2 * M))
+        return self.cache["window"]
 
     @property
     def grid(self) -> Grid:
@@ -276,7 +278,7 @@ class DriveData:
     def only(self, frames: BoolArray) -> DriveData:
         """The same drives, of which only these `frames` (frame,) count."""
         other = copy.copy(self)
-        other.cache = {k: v for k, v in self.cache.items() if k == "grid"}
+        other.cache = {k: v for k, v in self.cache.items() if k in ("grid", "window", "rate")}
         other.used = self.used.copy()
         other.used[self.used] = frames
         other.frame_time, other.measured = self.frame_time[frames], self.measured[:, frames]
@@ -315,7 +317,9 @@ class DriveData:
     def speed_difference(self, speed: FloatArray) -> FloatArray:
         """Central difference [m/s²], in phase with the acceleration."""
         out = np.empty_like(speed)
-        out[1:-1] = (speed[2:] - speed[:-2]) / np.maximum(self.time[2:] - self.time[:-2], 0.3 * self.dt)
+        if "rate" not in self.cache:
+            self.cache["rate"] = 1.0 / np.maximum(self.time[2:] - self.time[:-2], 0.3 * self.dt)
+        out[1:-1] = (speed[2:] - speed[:-2]) * self.cache["rate"]
         ends, begins = self.bounds[1:] - 1, self.bounds[:-1]
         out[ends], out[begins] = out[ends - 1], out[begins + 1]
         return out
@@ -359,7 +363,7 @@ class DriveData:
 
     def _with_bins(self, edges: IntArray) -> DriveData:
         other = copy.copy(self)
-        other.cache = {k: v for k, v in self.cache.items() if k == "grid"}
+        other.cache = {k: v for k, v in self.cache.items() if k in ("grid", "window", "rate")}
         other.band_edges = edges
         other.frequency = np.asarray(self.frequency[: int(edges[-1])], np.float64)
         other.measured = np.ascontiguousarray(self.measured[:, :, : edges[-1]])

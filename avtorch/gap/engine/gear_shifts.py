@@ -237,7 +237,7 @@ class _PulseLikelihood:
     """log L as a quadratic of pulses of the demand, other parameters being free.
 
     `score` (row,) is s~; `columns` (parameter, row) Z; `inverse` (parameter, parameter) N^-1; `information` (lag,) of
-    A and `cover` (row,) of D; `demand` (row,) [m/s²] the positive part of what drives the car.
+    A and `cover` (row,) of D; `demand` (row,) [m/s²] the positive part of what drives the car; `since` [s] the effect acts.
     """
 
     data: DriveData
@@ -247,6 +247,7 @@ class _PulseLikelihood:
     information: FloatArray
     cover: FloatArray
     demand: FloatArray
+    since: float
 
     @classmethod
     def of(cls, h: Hypothesis, residual: FloatArray) -> _PulseLikelihood:
@@ -264,11 +265,13 @@ class _PulseLikelihood:
         late = data.time - coordinate_from_start(h, "dead_time")
         demand = h["K_L"] * np.interp(late, data.time, np.maximum(h.command(), 0.0))
         information = demand_information(h, h.covariance, lags, dead_time=False)
-        return cls(data, score, columns, inverse, information, frame_cover(h), demand)
+        since = h.onsets.get("gear_shift", -math.inf)
+        return cls(data, score, columns, inverse, information, frame_cover(h), demand, since)
 
     def upshifts(self, level: float, hysteresis: float) -> FloatArray:
         data = self.data
-        return upshift_times(data.time, data.smooth_speed, data.starts, level, hysteresis)
+        times = upshift_times(data.time, data.smooth_speed, data.starts, level, hysteresis)
+        return times[times >= self.since]
 
     def pulses(self, times: FloatArray, duration: float) -> _Pulses:
         """Of upshifts at `times` (upshift,) [s]; the plant's interruption begins a step of its grid later."""

@@ -212,23 +212,7 @@ class Search:
             self.progress("effects", min(self.fits, self.most_fits), self.most_fits)
 
     def _candidates(self, h: Hypothesis) -> list[EngineEffect]:
-        data, own = h.data, {base_name(e) for e in h.effects}
-        out = []
-        for e in EFFECTS.values():
-            if e.name not in self.effects and e.base not in self.effects:
-                continue
-            if e.base in own or e.name == "command_hold" or not e.needs <= set(data.channels):
-                continue
-            if h.force is not None and e.base in h.force.takes_up:
-                continue
-            if e.name == "~linear" and not self.alone:
-                continue
-            if e.name == "low_speed_creep" and (data.smooth_speed < _SLOW_MPS).mean() < 0.01:
-                continue
-            if e.name == "gear_shift" and not len(h.shift_speeds):
-                continue
-            out.append(e)
-        return out
+        return tried(h, self.effects, alone=self.alone)
 
     def _add(
         self, h: Hypothesis, effect: str, start: Sequence[float], onset: float | None, iterations: int = 7
@@ -302,8 +286,29 @@ class Search:
             yield max((self._put(self._add(rest, e, s, None)) for s in starts), key=lambda x: x.score)
 
 
+def tried(h: Hypothesis, among: Collection[str], *, alone: bool = False) -> list[EngineEffect]:
+    """The effects that may be added to `h`, those `among` which its drives can show; `alone`: with one channel."""
+    data, own = h.data, {base_name(e) for e in h.effects}
+    out = []
+    for e in EFFECTS.values():
+        if e.name not in among and e.base not in among:
+            continue
+        if e.base in own or e.name == "command_hold" or not e.needs <= set(data.channels):
+            continue
+        if h.force is not None and e.base in h.force.takes_up:
+            continue
+        if e.name == "~linear" and not alone:
+            continue
+        if e.name == "low_speed_creep" and (data.smooth_speed < _SLOW_MPS).mean() < 0.01:
+            continue
+        if e.name == "gear_shift" and not len(h.shift_speeds):
+            continue
+        out.append(e)
+    return out
+
+
 # promises ------------------------------------------------------------------------------------------------------------
-class _Projection:
+class Projection:
     """The residual and any response less what the free parameters take, in units of the noise.
 
     Priors are rows of their own: a recorder stretched to its limits to hide an effect pulls back.
@@ -364,7 +369,7 @@ def _by_frame(data: DriveData, whitened: FloatArray) -> FloatArray:
 def promises(h: Hypothesis, candidates: Sequence[EngineEffect]) -> list[Promise]:
     """Gains of further effects to first order, the best first: at most two a effect that act all the time, and one
     that sets in later."""
-    projection = _Projection(h)
+    projection = Projection(h)
     adjoint = _adjoint_rows(h, projection)
     response = h.rows()
     out: list[Promise] = []
@@ -400,7 +405,7 @@ def promises(h: Hypothesis, candidates: Sequence[EngineEffect]) -> list[Promise]
 
 
 def _whole(
-    h: Hypothesis, projection: _Projection, e: EngineEffect, start: tuple[float, ...], whitened: FloatArray
+    h: Hypothesis, projection: Projection, e: EngineEffect, start: tuple[float, ...], whitened: FloatArray
 ) -> list[Promise]:
     free = projection(whitened)
     size, gain = float(free @ free), float(free @ projection.residual)
@@ -410,7 +415,7 @@ def _whole(
     return [Promise(projection.nats(free, e, start), e.name, turned, None)]
 
 
-def _by_slope(h: Hypothesis, projection: _Projection, e: EngineEffect, start: tuple[float, ...]) -> list[Promise]:
+def _by_slope(h: Hypothesis, projection: Projection, e: EngineEffect, start: tuple[float, ...]) -> list[Promise]:
     """By the slope at zero, where the recorder hides a finite step."""
     name = e.coordinates[0].name
     if name not in _SLOPES or e.onset == "must":
@@ -425,7 +430,7 @@ def _by_slope(h: Hypothesis, projection: _Projection, e: EngineEffect, start: tu
 
 def _onsets(
     h: Hypothesis,
-    projection: _Projection,
+    projection: Projection,
     e: EngineEffect,
     start: tuple[float, ...],
     values: FloatArray,
@@ -464,7 +469,7 @@ def _onsets(
     return out
 
 
-def _adjoint_rows(h: Hypothesis, projection: _Projection) -> list[FloatArray]:
+def _adjoint_rows(h: Hypothesis, projection: Projection) -> list[FloatArray]:
     """The projected residual on the rows of each channel: its inner product with a response is that of the whitened
     coefficients."""
     data = h.data

@@ -73,6 +73,15 @@ def row_attribution(rows: CountedRows, h: Hypothesis, base: Hypothesis) -> RowAt
     return RowAttribution(record=rows, gained=gained, paid=float(cost), does=does, felt=felt, moved=moved)
 
 
+def change_attribution(rows: CountedRows, h: Hypothesis, change: FloatArray, paid: float) -> RowAttribution:
+    """The attribution of a change of coefficients (channel, frame, bin) that takes so much of the residual of `h`, for
+    `paid` nats."""
+    before, after = _squares(h, h.residual), _squares(h, h.residual - change)
+    does = rows.of_rows(_squares(h, change)).sum(1)
+    moved = np.stack([rows.of_rows(h.data.adjoint(x)).mean(-1) for x in change])
+    return RowAttribution(rows, rows.of_rows(before - after).sum(1), paid, does, np.zeros_like(does), moved)
+
+
 def _squares(h: Hypothesis, x: FloatArray) -> FloatArray:
     """Half the squares (row,) of coefficients (channel, frame, bin) in units of the noise."""
     data = h.data

@@ -146,6 +146,8 @@ def budget_of(
     unnamed = _quantity(rest)
     beyond = float((rest > material).mean()) if parts else 0.0
     matters = beyond > 0.95 if parts else tuple(names) == ("unknown",)
+    if not parts and names[0] not in ("none", "unknown"):  # chance alone is named, and no part of a simulator is
+        matters = held.free and _surely_takes_off(energy, seed) > material
     most = max(sum(p.share.mean for p in parts), 1.0)  # an effect without a name may cost instead of taking off
     parts = [replace(p, share=p.share.scaled(1 / most)) for p in parts]
     unnamed = _shifted(unnamed, 1 - sum(p.share.mean for p in parts) - unnamed.mean)
@@ -243,6 +245,14 @@ def _resampled(energy: FloatArray, floor: FloatArray, seed: int) -> FloatArray:
     alike = np.full_like(parts, 1.0 / max(parts.shape[1] - 1, 1))  # where runs show no gap, shares say nothing
     alike[:, -1] = 0.0 if parts.shape[1] > 1 else 1.0
     return np.where(total > _NOTHING * levels[:, :1], parts / np.maximum(total, 1e-300), alike)
+
+
+def _surely_takes_off(energy: FloatArray, seed: int) -> float:
+    """The lower end of what the last step takes off, in shares of the error before, under resampled blocks."""
+    blocks = energy.shape[1]
+    pick = np.random.default_rng(seed).integers(0, blocks, (_RESAMPLES, blocks))
+    before, named, last = (energy[k][pick].mean(1) for k in (0, -2, -1))
+    return float(np.quantile((named - last) / before, 0.05))
 
 
 def _still(held: HeldOut, seed: int) -> Quantity:

@@ -13,7 +13,7 @@ products B, held out,
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -24,6 +24,7 @@ from avtorch.arrays import BoolArray, FloatArray
 from avtorch.gap.answer.budget import HORIZON_S
 from avtorch.gap.engine.coordinates import INDEX, base_name
 from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.family import family_of
 from avtorch.gap.engine.gauss_newton import fit, linear_priors, linearised, penalty
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance, whiten
@@ -53,7 +54,8 @@ class HeldOut:
     `steps`: scores of each hypothesis of `chain`, then of the last one with the `free` form, if there is one; `floor`,
     `ceiling`: of the last and the first hypothesis with a black box on top (`black_box_rest`), the floor no higher than
     the last step. `possible` (draw, channel, block): squares of free runs of what the black box may have missed.
-    `horizon_s` of the free runs.
+    `horizon_s` of the free runs. `apart`: of the last step without a family of causes, by its name, everything else
+    refitted.
     """
 
     chain: tuple[Hypothesis, ...]
@@ -65,6 +67,7 @@ class HeldOut:
     possible: FloatArray = field(repr=False)
     horizon_s: float
     free: bool = False
+    apart: Mapping[str, Scores] = field(default_factory=dict, repr=False)
 
     @property
     def data(self) -> DriveData:
@@ -85,7 +88,9 @@ class HeldOut:
 
     def without_free(self) -> HeldOut:
         """The same chain without its free form."""
-        return replace(self, steps=self.steps[:-1], floor=self.rival, free=False) if self.free else self
+        if not self.free:
+            return self
+        return replace(self, steps=self.steps[:-1], floor=self.rival, free=False, apart={})
 
     @property
     def frame_rows(self) -> FloatArray:
@@ -143,7 +148,35 @@ def held_out_errors(chain: Sequence[Hypothesis], free: FittedForm | None = None)
         possible=possible[0],
         horizon_s=min(HORIZON_S, longest),
         free=free is not None,
+        apart=_apart(fitted[-1].hypothesis, scored, blocks, free),
     )
+
+
+def _apart(full: Hypothesis, scored: Sequence[Scores], blocks: Blocks, free: FittedForm | None) -> dict[str, Scores]:
+    """Scores without each family that acts in a free run, the free form being one of the force maps."""
+    families: dict[str, list[str]] = {}
+    for e in _sized(full):
+        families.setdefault(family_of(base_name(e)), []).append(e)
+    out = {}
+    for family, own in families.items():
+        rest = full
+        for e in own:
+            rest = _less(rest, e)
+        beside = None if family == "force map" else free
+        if len(own) == len(_sized(full)) and beside is None:
+            out[family] = scored[0]  # the bare baseline
+            continue
+        rest = fit(rest, 6, 0.1)
+        if beside is None:
+            fitted = _taught(rest, blocks)
+            errors = blocks.stitched(list(fitted.errors))
+            out[family] = _scores(full.data, blocks, errors, fitted.residuals, fitted.residuals)
+        else:
+            rest["T_L"] = float(np.clip(beside.form.T_L * rest["T_L"] / full["T_L"], *rest.limits("T_L")))
+            out[family] = _with_form(beside, blocks, rest)
+    if free is not None and "force map" not in out:
+        out["force map"] = scored[-2]
+    return out
 
 
 def nested(base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis] = ()) -> list[Hypothesis]:
@@ -243,15 +276,19 @@ def _key(h: Hypothesis, without: str | None = None) -> frozenset[tuple[str, bool
 
 
 def _refitted(h: Hypothesis, without: str) -> Hypothesis:
-    rest = h.without(without)
-    if without == "dead_time":  # what was a delay is a lag now
+    return fit(_less(h, without), 6, 0.1)
+
+
+def _less(h: Hypothesis, effect: str) -> Hypothesis:
+    rest = h.without(effect)
+    if effect == "dead_time":  # what was a delay is a lag now
         rest["T_L"] += 0.8 * h["dead_time"]
-    return fit(rest, 6, 0.1)
+    return rest
 
 
-def _with_form(free: FittedForm, blocks: Blocks) -> Scores:
-    """Of a hypothesis with its free form, which each fold's other blocks teach."""
-    h = free.lagged
+def _with_form(free: FittedForm, blocks: Blocks, beside: Hypothesis | None = None) -> Scores:
+    """Of a hypothesis with its free form, which each fold's other blocks teach; `beside`: in place of the form's."""
+    h = free.lagged if beside is None else beside
     accel, gained = h.on_grid()
     grid = h.data.grid
     step = np.where(grid.starts, 0.0, np.diff(grid.time, prepend=grid.time[:1]))

@@ -251,11 +251,19 @@ def _rate_onset(h: Hypothesis, rows: Sequence[int]) -> float | None:
 
 def verdict_names(average: ModelAverage) -> tuple[str, ...]:
     """Causes of the most probable hypothesis that, they or their aliases, are there with a probability of a half or
-    more, and others of which that holds by themselves, the likeliest first; `("none",)` or `("unknown",)`, the more
-    probable, where there are none."""
+    more, and others of which that holds by themselves, beside those that they could stand in for, the likeliest first;
+    `("none",)` or `("unknown",)`, the more probable, where there are none."""
     names = {n for label in average.probabilities for n in label.split("+")} - set(ALWAYS)
-    own = set(average.label.split("+"))
-    likely = [n for n in names if (part_probability(average, n) if n in own else average.marginal(n)) >= LIKELY]
+    own = set(average.label.split("+")) - set(ALWAYS)
+    stands_for = {n: {m for m in own if n in aliases_of(average, m)} - {n} for n in names}
+
+    def there(n: str) -> float:
+        if n in own:
+            return part_probability(average, n)
+        with_all = {n, *stands_for[n]}
+        return sum(p for label, p in average.probabilities.items() if with_all <= set(label.split("+")))
+
+    likely = [n for n in names if there(n) >= LIKELY]
     if likely:
         return tuple(sorted(likely, key=lambda n: (-average.marginal(n), n)))
     return (max(ALWAYS, key=lambda n: average.probabilities[n]),)

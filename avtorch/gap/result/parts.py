@@ -14,37 +14,19 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.answer.budget import LIKELY
-from avtorch.gap.engine.average import ModelAverage, Weight
+from avtorch.gap.answer.location import Location
+from avtorch.gap.engine.average import ModelAverage, Weight, free_form_response
 from avtorch.gap.engine.coordinates import EFFECTS, base_name
-from avtorch.gap.engine.force_map import CURVES, ForceMap
+from avtorch.gap.engine.family import FORMS, family_of
+from avtorch.gap.engine.force_map import ForceMap
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.priors import TEMPER
+from avtorch.gap.engine.search import Search
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.hypotheses import LEAST_LISTED, part_probability
 from avtorch.gap.result.parameters import ParameterPosterior
 from avtorch.io.units import GRAVITY
 
-FAMILIES = {
-    "force map": CURVES,
-    "dynamics": (
-        *("dead_time", "backlash", "second_order_actuator", "rate_limit", "speed_dependent_lag", "gear_shift"),
-        "driveline_oscillation",
-    ),
-    "place": ("road_grade",),
-    "time": ("gain_change",),
-    "sensor": ("sensor_lag", "sensor_bias", "sensor_scale"),
-    "chance": ("gust", "outliers", "command_hold"),
-}
-"""Where each effect acts."""
-FORMS = {
-    "linear": ("dynamics", "other linear dynamics"),
-    "sided": ("dynamics", "lags that depend on the sign of the command"),
-    "tone": ("dynamics", "a steady tone"),
-    "map": ("force map", "a force map"),
-    "gain": ("time", "a gain that wanders"),
-    "delay": ("time", "a delay that wanders"),
-}
-"""Where each free form acts, and what it is."""
 _DRAWS = 400
 
 
@@ -53,7 +35,7 @@ class AnswerPart:
     """A part of what the simulator lacks: `name` of an effect, None of a free form; its `family`; `form` of a free one.
 
     `size_mps2`: root mean square of what it adds to the acceleration or to the rate of the speed, None where that is
-    not measured. `force_map`: the curve of a force map.
+    not measured. `force_map`: the curve of a force map. `where` a free form acts, in time, speed, command, frequency.
 
     Example:
         >>> from avtorch.gap.result.parts import AnswerPart
@@ -67,6 +49,7 @@ class AnswerPart:
     size_mps2: Quantity | None
     probability: float
     force_map: ForceMap | None = field(default=None, repr=False)
+    where: tuple[Location, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """An entry of `parts` in `diagnosis.json`."""
@@ -76,16 +59,51 @@ class AnswerPart:
             "form": self.form,
             "size_mps2": None if self.size_mps2 is None else self.size_mps2.to_dict(),
             "probability": self.probability,
+            "where": [place.to_dict() for place in self.where],
         }
 
 
+@dataclass(frozen=True, eq=False)
+class UnnamedResponse:
+    """What a free `form` beside a `hypothesis` does: `change` (channel, frame, bin), and `size_mps2` of it, the root
+    mean square over the rows of the channel that shows it most."""
+
+    form: str
+    hypothesis: Hypothesis
+    change: FloatArray = field(repr=False)
+
+    @property
+    def size_mps2(self) -> float:
+        data = self.hypothesis.data
+        rows = max(data.frame_count * data.frame_rows, 1)
+        return float(np.sqrt((self.change**2).sum((1, 2)).max() / rows))
+
+
+def unnamed_response(average: ModelAverage, weight: Weight, search: Search) -> UnnamedResponse | None:
+    """What the likeliest free form does beside the weight's hypothesis, if one is likely, or stands for `unknown`."""
+    if not average.parts:
+        return None
+    form, probability = max(average.parts.items(), key=lambda kv: kv[1])
+    if weight.label == "unknown":
+        form = weight.part or form
+    elif sum(p for f, p in average.parts.items() if family_of(f) == family_of(form)) < LIKELY:
+        return None
+    change = free_form_response(weight.examined, search, form) if probability >= LEAST_LISTED else None
+    return None if change is None else UnnamedResponse(form, weight.examined.hypothesis, change)
+
+
 def parts_of(
-    average: ModelAverage, names: Sequence[str], posterior: ParameterPosterior, seed: int = 0
+    average: ModelAverage,
+    names: Sequence[str],
+    posterior: ParameterPosterior,
+    seed: int = 0,
+    unnamed: UnnamedResponse | None = None,
+    where: tuple[Location, ...] = (),
 ) -> tuple[AnswerPart, ...]:
     """The named parts of the verdict, in its order, then the force map and the other free forms, the likeliest first;
-    `posterior`: of the verdict's weight."""
+    `posterior`: of the verdict's weight; `unnamed`: what the likeliest free form does, and `where`."""
     parts = [
-        AnswerPart(name, _family(name), None, _size(posterior, name), part_probability(average, name))
+        AnswerPart(name, family_of(name), None, _size(posterior, name), part_probability(average, name))
         for name in names
         if name not in ("none", "unknown")
     ]
@@ -97,7 +115,9 @@ def parts_of(
         parts.append(AnswerPart(None, "force map", form, map_size(h, seed), present, h.force_map))
     for form, probability in sorted(average.parts.items(), key=lambda kv: -kv[1]):
         if probability >= LEAST_LISTED:
-            parts.append(AnswerPart(None, FORMS[form][0], form, None, probability))
+            own = unnamed is not None and unnamed.form == form
+            size = Quantity(unnamed.size_mps2, 0.0, *2 * [unnamed.size_mps2]) if own and unnamed is not None else None
+            parts.append(AnswerPart(None, family_of(form), form, size, probability, None, where if own else ()))
     return tuple(parts)
 
 
@@ -106,18 +126,28 @@ def force_map_of(parts: Sequence[AnswerPart]) -> ForceMap | None:
     return next((p.force_map for p in parts if p.force_map is not None and p.probability >= LIKELY), None)
 
 
-def said_of_unnamed(parts: Sequence[AnswerPart]) -> str:
-    """A sentence on the likely part without a name, else nothing."""
-    part = next((p for p in parts if p.name is None and p.probability >= LIKELY), None)
-    if part is None:
+def said_of_unnamed(parts: Sequence[AnswerPart], unknown: bool = False, epoch_s: float = 0.0) -> str:
+    """A sentence on the likely part without a name, or on what an `unknown` cause is most like; else nothing. Times
+    count from `epoch_s`."""
+    free = [p for p in parts if p.name is None]
+    family = max(free, key=lambda p: p.probability).family if free else ""
+    own = [p for p in free if p.family == family]
+    probability = min(sum(p.probability for p in own), 1.0)
+    if not own or (probability < LIKELY and not unknown):
         return ""
-    if part.size_mps2 is None:
-        return f"A part without a name is {FORMS[str(part.form)][1]} (probability {part.probability:.2g})."
-    of = "the speed has" if part.form == "R(v)" else "command and speed have"
-    return (
-        f"A part without a name is the force map {part.form}: the car's force differs from K u by "
-        f"{part.size_mps2.mean:.2g} m/s² as {of} it (probability {part.probability:.2g})."
-    )
+    part = max(own, key=lambda p: (p.size_mps2 is not None, p.probability))
+    if part.family == "force map" and part.size_mps2 is not None and part.form not in FORMS:
+        of = "the speed has" if part.form == "R(v)" else "command and speed have"
+        return (
+            f"A part without a name is the force map {part.form}: the car's force differs from K u by "
+            f"{part.size_mps2.mean:.2g} m/s² as {of} it (probability {probability:.2g})."
+        )
+    what = "It is most like" if unknown else "A part without a name is of the"
+    size = "" if part.size_mps2 is None else f", {part.size_mps2.mean:.2g} m/s² in the root mean square"
+    places = ", ".join(place.words(epoch_s) for place in part.where)
+    lies = f", {places}" if places else ""
+    kind = f"{family}, {FORMS[str(part.form)][1]}" if not unknown else f"{FORMS[str(part.form)][1]} ({family})"
+    return f"{what} {kind}{size}{lies} (probability {probability:.2g})."
 
 
 def map_size(h: Hypothesis, seed: int = 0) -> Quantity:
@@ -132,11 +162,6 @@ def map_size(h: Hypothesis, seed: int = 0) -> Quantity:
 
 
 # inside ---------------------------------------------------------------------------------------------------------------
-def _family(name: str) -> str:
-    """The family of an effect; that of a user's own is not known to the table."""
-    return next((family for family, names in FAMILIES.items() if name in names), "own")
-
-
 def _with_map(average: ModelAverage, weight: Weight) -> Weight | None:
     """The weight, or else the strongest of the average, that has a force map."""
     having = [w for w in average.best.values() if w.examined.hypothesis.force is not None]
