@@ -33,10 +33,13 @@ PAGE = "comparison.html"
 
 
 def compare(
-    before: Path,
-    after: Path | None = None,
+    logs: list[Path],
     /,
     *,
+    after: Annotated[
+        list[Path] | None,
+        Parameter(negative=(), consume_multiple=True, help="The drives after the change; all of LOGS are before it."),
+    ] = None,
     simulator: Annotated[
         list[str] | None,
         Parameter(
@@ -54,10 +57,10 @@ def compare(
         float | None, Parameter(help="The simulators' own step [s], if they take no other; default: the log's.")
     ] = None,
     baseline: Annotated[
-        str, Parameter(help="The simulator: effects such as dead_time=0.2, or TOML; glvd is fitted to BEFORE.")
+        str, Parameter(help="The simulator: effects such as dead_time=0.2, or TOML; glvd: fitted to the drives before.")
     ] = "glvd",
     baseline_after: Annotated[
-        str | None, Parameter(help="The simulator that AFTER is compared with; default: the same.")
+        str | None, Parameter(help="The simulator of the drives after; default: the same.")
     ] = None,
     out: Annotated[
         Path | None,
@@ -71,22 +74,23 @@ def compare(
 ) -> None:
     """Did a change to the car, or to the simulator, help? By how much, with intervals.
 
-    Two simulators and one log: which is nearer to the car, and by what. Several drives a side: `avtorch.compare` in
-    Python takes lists.
+    Two simulators and one log: which is nearer to the car, and by what.
 
     Parameters
     ----------
-    before
-        A log, as for diagnose: the drive before the change; or the only one, with two simulators.
-    after
-        The drive after it; with one simulator or none.
+    logs
+        Logs, as for diagnose: the drive before the change and the one after it; with --after any number before it; with
+        two simulators a single one.
     """
     if out is not None:
         free_folder(out)
     elif open_page:
         raise InputError("--open: found without --out; needs a folder for the page")
     two = [*(simulator or ()), *(simulated or ())]
-    if after is None:
+    before, later = (logs, after) if after else (logs[:1], logs[1:])
+    if len(later) > 1 and not after:
+        raise InputError(f"LOGS: found {len(logs)}, needs two; with more, say --after before those after the change")
+    if not later:
         if not two:
             raise InputError(
                 "AFTER: missing; needs a file, or two of --simulator and --simulated, see avtorch compare --help"
@@ -96,14 +100,14 @@ def compare(
         if baseline != "glvd" or baseline_after is not None:
             raise InputError("--baseline: found beside --simulator or --simulated, needs a plant as --simulator")
         talk = Talk(json=json, quiet=quiet)
-        log = _log(before, map, unit, talk)
-        first, second = simulators_of(simulator or (), simulated or (), step, before, log)
+        log = _log(logs[0], map, unit, talk)
+        first, second = simulators_of(simulator or (), simulated or (), step, logs[0], log)
 
         from avtorch.external import compare_simulators
 
         with talk.progress("Comparing") as step_done:
             found = compare_simulators(log, first, second, progress=step_done)
-        files = [before, *_files([*two])]
+        files = [*logs, *_files([*two])]
         origin = origin_of(files, map=map, unit=unit, simulator=simulator, simulated=simulated, step=step)
         _answer(talk, found, out, [log], origin, open_page)
         if not talk.json:
@@ -111,7 +115,7 @@ def compare(
                 talk.notes(which.name, which.notes)
         return
     if len(simulator or ()) > 1:
-        raise InputError(f"--simulator: found {len(two)} beside two logs, needs one, or one log")
+        raise InputError(f"--simulator: found {len(two)} beside several logs, needs one, or one log")
     if two and (baseline != "glvd" or baseline_after is not None):
         raise InputError("--baseline: found beside --simulator or --simulated, needs one simulator")
     base = read_simulator("--baseline", baseline)
@@ -122,13 +126,14 @@ def compare(
     from avtorch.gap.compare import compare as work
 
     talk = Talk(json=json, quiet=quiet)
-    logs = [_log(path, map, unit, talk) for path in (before, after)]
-    drives = [(before, logs[0]), (after, logs[1])]
+    sides = [[_log(path, map, unit, talk) for path in paths] for paths in (before, later)]
+    read = [*sides[0], *sides[1]]
+    drives = list(zip([*before, *later], read, strict=True))
     own = simulator_of(simulated or (), (simulator or (None,))[0], step, drives, adjust=(), rollouts=None, processes=1)
     with talk.progress("Comparing") as step_done:
-        comparison = work(*logs, baseline=own or base, baseline_after=other, progress=step_done)
+        comparison = work(*sides, baseline=own or base, baseline_after=other, progress=step_done)
     origin = origin_of(
-        [before, after, *_files([*two, baseline, baseline_after or ""])],
+        [*before, *later, *_files([*two, baseline, baseline_after or ""])],
         map=map,
         unit=unit,
         simulator=simulator,
@@ -136,7 +141,7 @@ def compare(
         step=step,
         baseline=[baseline, baseline_after],
     )
-    _answer(talk, comparison, out, logs, origin, open_page)
+    _answer(talk, comparison, out, read, origin, open_page)
 
 
 def _files(sources: Sequence[str]) -> list[Path]:

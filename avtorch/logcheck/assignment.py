@@ -44,6 +44,9 @@ _LOST = 0.05
 """Share of right columns whose correlation is anything: noise, a slope, a driver at the pedals."""
 _CALM = 0.01
 """Change within a span, as a share of the top speed, below which a drive tells nothing about names."""
+_CHANCE = 3.1
+"""Standard deviations of Fisher's z beyond which a correlation lies once in 500 tries; each column has some forty, by
+channels, spans and delays."""
 _ALIKE = 0.98  # correlation from which two columns measure one thing
 _TRIED, _KEPT = 60, 3  # columns without a telling name that are compared with the others, and kept of them
 _DELAYS_S = tuple(np.arange(0, 1.01, 0.1).tolist())
@@ -129,6 +132,9 @@ class _Motion:
         self.number = {name: i for i, name in enumerate(self.columns)}
         values = [filled(column) for column in self.columns.values()]
         self.tables = [table for span in SPANS_S if (table := _table(clock, parts, values, span)) is not None]
+        spans = [table[0].shape[-1] / 4 for table in self.tables]
+        self.by_chance = math.tanh(_CHANCE / math.sqrt(min(spans) - 3)) if spans else 0.0
+        """Size up to which a correlation may be chance, by how many spans lie side by side."""
 
     def same(self, signal: str, a: Column, b: Column) -> bool:
         """Whether two columns measure the same."""
@@ -296,6 +302,8 @@ def _question(signal: str, choices: list[tuple[float, dict[str, Column | None]]]
         if score - other_score > PLAIN:
             break
         if other is None or other is column or motion.same(signal, column, other):
+            continue
+        if signal not in other.likeness and abs(motion.strength(signal, other, of)) < motion.by_chance:
             continue
         return (
             f"which column is {signal}? {column.name} by {said} ({_with(signal, column, best, motion)}), or "

@@ -40,7 +40,8 @@ def header_of(name: str, stated: str | None = None) -> Header:
         rest = bracketed["name"]
         unit = unit or unit_named(bracketed["unit"])
     elif (behind := _BEHIND.match(name)) is not None and (found := unit_named(behind["unit"])) is not None:
-        if behind["unit"].lower() in _ONLY_IN_BRACKETS:
+        amperes = behind["unit"] == "A" and behind["name"].islower()  # as of current_A
+        if behind["unit"].lower() in _ONLY_IN_BRACKETS and not amperes:
             bare = found
         else:
             rest, unit = behind["name"], unit or found

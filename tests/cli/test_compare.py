@@ -3,8 +3,10 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import avtorch
 from avtorch.cli import main
 from avtorch.external import write_fmu
 from avtorch.gap import plant
@@ -26,6 +28,18 @@ def test_it_says_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert told["changed"] is True
     assert main(["compare", str(one), str(one), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["changed"] is False
+
+
+@pytest.mark.slow
+def test_several_drives_a_side_are_compared_as_in_python(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [tmp_path / f"{name}.csv" for name in ("a1", "a2", "b1", "b2")]
+    for i, path in enumerate(files):
+        log_of(plant(T_L=0.3 if i < 2 else 0.6), seconds=30.0, rng=np.random.default_rng(i)).write(path)
+    names = [*map(str, files)]
+    assert main(["compare", *names[:2], "--after", *names[2:], "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [told[side]["segments"] for side in ("before", "after")] == [2, 2]
+    assert told == json.loads(json.dumps(avtorch.compare(names[:2], names[2:]).to_dict()))
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +103,7 @@ REFUSED = [
     (["--simulator", "T_L=0.4", "--simulated", "none."], "'none.': no such file, and"),
     (["--simulator", "T_L=0.4", "--simulator", "K_L=0.9", "--step", "0.1"], "--step: has a meaning with an object"),
     (["--simulator", "T_L=0.4", "--simulator", "K_L=0.9", "--baseline", "T_L=0.2"], "--baseline: found beside"),
-    (["{}/real.csv", "--simulator", "T_L=0.4", "--simulator", "T_L=0.5"], "found 2 beside two logs, needs one"),
+    (["{}/real.csv", "--simulator", "T_L=0.4", "--simulator", "T_L=0.5"], "found 2 beside several logs, needs one"),
     (["{}/real.csv", "--simulator", "my_car:Car", "--baseline", "T_L=0.2"], "--baseline: found beside"),
     (["{}/real.csv", "--simulator", "T_L=0.4"], "found 'T_L=0.4', needs MODULE:NAME"),
     (["{}/real.csv", "--simulated", "{}/sim.csv"], "--simulated: found 1 files for 2 logs"),
@@ -112,6 +126,7 @@ def test_what_it_cannot_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     log_of(seconds=60.0).write(one)
     for arguments, told in (
         ([str(one), str(tmp_path / "none.csv")], "none.csv"),
+        ([str(one)] * 3, "LOGS: found 3, needs two; with more, say --after"),
         ([str(one), str(one), "--baseline", "no_such=1"], "--baseline"),
         ([str(one), str(one), "--baseline-after", "dead_time=0.1"], "--baseline-after"),
     ):

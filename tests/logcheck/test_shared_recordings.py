@@ -22,6 +22,7 @@ def test_a_log_with_avtorchs_names_needs_no_mapping(data_dir: Path, name: str) -
     assert found.fault is None
     assert found.proposal is not None
     assert not found.proposal.needed, found.proposal
+    assert not any("current_A" in doubt for doubt in found.proposal.doubts)  # amperes, and no acceleration
     assert found.excitation
 
 
