@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 import webbrowser
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -21,8 +22,9 @@ from avtorch.errors import printable
 if TYPE_CHECKING:
     from avtorch.report.table import Table
 
-EVERY_S = 10.0
-"""Wall-clock time between two lines of progress [s]; a command that takes less prints none."""
+EVERY_S = float(os.environ.get("AVTORCH_PROGRESS_S", 10.0))
+"""Wall-clock time between two lines of progress [s]; a command that takes less prints none. A program that starts the
+command may ask for more of them."""
 
 
 class SafeConsole(Console):
