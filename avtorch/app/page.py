@@ -8,13 +8,13 @@ import shlex
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import panel as pn
 
 from avtorch.app.controls import STYLES, Chart, CheckBox, Slider
 from avtorch.app.task import Job, Task
-from avtorch.app.workplace import MOST_MB, examples
+from avtorch.app.workplace import MOST_MB, Bench, examples
 from avtorch.errors import InputError, printable
 from avtorch.gap.quantity import words_of
 from avtorch.io import Log
@@ -25,9 +25,6 @@ from avtorch.io.tables import read_table
 from avtorch.logcheck.check import LogCheck, check
 from avtorch.remedy.trial import Trial
 from avtorch.report.page import text_of
-
-if TYPE_CHECKING:
-    from avtorch.app.serve import Bench
 
 _NONE = "not in the log"
 _ACCELS = ["m/s2", "g", "ft/s2", "-1"]

@@ -4,23 +4,12 @@ from __future__ import annotations
 
 import logging
 import mimetypes
-import os
-import secrets
-import threading
 from typing import Any
 
-from avtorch.app.workplace import MOST_MB, Workplace
+from avtorch.app.workplace import MOST_MB, Bench
 from avtorch.errors import InputError
 
 ADDRESS = "127.0.0.1"
-
-
-class Bench:
-    """What the tabs of a server share: the folder, the token, and how many commands may run at once."""
-
-    def __init__(self, workplace: Workplace) -> None:
-        self.workplace, self.token = workplace, secrets.token_urlsafe(32)
-        self.slots = threading.Semaphore(max(1, (os.cpu_count() or 2) // 2))
 
 
 def handlers(bench: Bench) -> list[tuple[str, type]]:

@@ -100,10 +100,11 @@ class Job:
                 )
                 self.state, self.line = "running", "Starting"
             assert process.stderr is not None
-            for line in process.stderr:
-                last.append(line.strip())
-                if (told := _PERCENT.search(line)) is not None:
-                    self.percent, self.line = int(told[1]), line.strip()
+            with process.stderr as lines:
+                for line in lines:
+                    last.append(line.strip())
+                    if (told := _PERCENT.search(line)) is not None:
+                        self.percent, self.line = int(told[1]), line.strip()
             code = process.wait()
         if code and not self._cancelled:
             own = [line.removeprefix("avtorch: ") for line in last if line.startswith("avtorch: ")]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+import secrets
 import shutil
+import threading
 from dataclasses import dataclass
 from itertools import count, islice
 from pathlib import Path
@@ -97,6 +99,14 @@ class Workplace:
             car = plant([DeadTime(0.3), SensorBias(0.15)], T_L=0.4, sigma=0.05)
             simulate(Leader.default(start=40.0, duration=90.0, dt=0.05), plant=car).log().write(path)
         return self.name_of(path)
+
+
+class Bench:
+    """What the tabs of a server share: the folder, the token, and how many commands may run at once."""
+
+    def __init__(self, workplace: Workplace) -> None:
+        self.workplace, self.token = workplace, secrets.token_urlsafe(32)
+        self.slots = threading.Semaphore(max(1, (os.cpu_count() or 2) // 2))
 
 
 def examples() -> dict[str, str]:

@@ -27,8 +27,8 @@ def workbench(
     folder
         The folder with your logs; nothing outside it is read. Answers go to its folder out.
     """
-    from avtorch.app.serve import Bench, server_of
-    from avtorch.app.workplace import Workplace
+    from avtorch.app.serve import server_of
+    from avtorch.app.workplace import Bench, Workplace
 
     if not 0 <= port < 65536:
         raise InputError(f"--port: found {port}, needs a number from 1 to 65535")

@@ -89,6 +89,7 @@ class Trial:
             for name, kind in sorted(EFFECTS.items())
             if not (name in own or kind.random or (kind.needs_speed and "speed" not in channels))
             and not (kind.place == "sensor" and "accel" not in channels)
+            and all(p.size == 1 for p in kind().coordinates())  # a road's profile is fitted, not set
             and any(key.startswith(f"{name}.") for key in self.sizes(self.with_effect(name)))
         ]
 

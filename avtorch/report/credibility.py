@@ -1,7 +1,7 @@
 """A diagnosis under the headings by which simulation toolchains are assessed: facts of the run, and what it cannot say.
 
-Headings as in the UN's guidelines on new assessment and test methods (NATM) and in Regulation (EU) 2022/1426, annex III,
-part 4. Nothing here is judged against a limit: that is the assessor's.
+Headings as in the UN's guidelines on new assessment and test methods (NATM) and in Regulation (EU) 2022/1426, annex
+III, part 4. Nothing here is judged against a limit: that is the assessor's.
 """
 
 from __future__ import annotations
@@ -81,7 +81,9 @@ def credibility_page(found: Diagnosis, *, quality: Iterable[str] = ()) -> Page:
         Section("What this run cannot say", items=_SILENT),
         Section(
             "Where an assessor's headings are answered",
-            tables=(Table("Headings of NATM and of (EU) 2022/1426, annex III, part 4", ("heading", "here"), _HEADINGS),),
+            tables=(
+                Table("Headings of NATM and of (EU) 2022/1426, annex III, part 4", ("heading", "here"), _HEADINGS),
+            ),
         ),
     )
     of = f"{log.name} · {log.seconds:.0f} s at {log.rate_hz:.3g} Hz"
@@ -129,7 +131,9 @@ def _scope(found: Diagnosis) -> Section:
     rows.append(("slope of the road", "measured" if "grade" in log.signals else "not measured; part of what is fitted"))
     rows.append(("signals", ", ".join(log.signals)))
     said = ("Speeds leave out the slowest and the fastest hundredth of the rows.",)
-    return Section("Scope of validity", tables=(Table("What the drives covered", ("quantity", "covered"), tuple(rows)),), soft=said)
+    return Section(
+        "Scope of validity", tables=(Table("What the drives covered", ("quantity", "covered"), tuple(rows)),), soft=said
+    )
 
 
 def _data(found: Diagnosis, quality: tuple[str, ...]) -> Section:
@@ -143,7 +147,8 @@ def _data(found: Diagnosis, quality: tuple[str, ...]) -> Section:
         lines.append("Nothing was held out.")
     else:
         what = "whole drives" if held.by_drives else "blocks of the drive"
-        lines.append(f"Held out in turn: {held.blocks} {what}; each is predicted by a fit that has not seen it.")
+        lines.append(f"Held out in turn: {held.blocks} {what}; each is predicted by parameters fitted without it.")
+        lines.append("Which causes are named was decided on all of the data.")
     return Section("Data used and held out", (" ".join(lines),), items=quality)
 
 
@@ -151,8 +156,9 @@ def _tried(found: Diagnosis) -> list[str]:
     base = ", ".join(f"{name} {q.mean:.3g}" for name, q in found.baseline.items())
     lines = [f"The baseline simulator, fitted to these drives without any effect: {base}."]
     if found.scope is not None:
-        lines.append(f"Causes that were looked for: {', '.join(found.scope.scored)}; several at once: {found.scope.pairs}.")
-        lines += sentences.untried(found.scope)
+        lines.append(
+            f"Causes that were looked for: {', '.join(found.scope.scored)}; several at once: {found.scope.pairs}."
+        )
     return lines
 
 
@@ -185,7 +191,12 @@ def _uncertainty(found: Diagnosis) -> Section:
     columns = found.summary().columns
     names = list(columns)
     rows = tuple(
-        (words_of(str(row[0]).rpartition(".")[2]), str(row[0]), *(f"{x:.3g}" for x in row[2:6]), unit_of(str(row[0]).rpartition(".")[2]))
+        (
+            words_of(str(row[0]).rpartition(".")[2]),
+            str(row[0]),
+            *(f"{x:.3g}" for x in row[2:6]),
+            unit_of(str(row[0]).rpartition(".")[2]),
+        )
         for row in zip(*columns.values(), strict=True)
     )
     says = "Of the repaired simulator" if found.belief else "Of the baseline simulator"
@@ -209,8 +220,10 @@ def _manoeuvres(found: Diagnosis) -> Section:
             times = ("" if x is None else f"{x:.2f}" for x in (response.rise, response.lag))
             title = f"{one.kind} at {one.begin:.1f} s, drive {one.log + 1}"
             rows.append((title, name, f"{response.peak:.2f}", *times, _band(one, name)))
-    said = f"A band of ±x about the measured acceleration holds {100 * _BAND:.0f} % of a manoeuvre's rows of a simulated one."
-    said += " ISO 19364 and its kin compare by such bands; they state none for these manoeuvres, so none is applied."
+    said = (
+        f"A band of ±x about the measured acceleration holds {100 * _BAND:.0f} % of the simulated rows of a manoeuvre. "
+        "ISO 19364 compares by bands of tolerance, which it states for steering; none is applied here."
+    )
     table = Table("Manoeuvres in which the baseline errs most", columns, tuple(rows), numeric=columns[2:])
     return Section("Manoeuvres", (said,), tables=(table,)) if rows else Section("Manoeuvres", ("None was recognised.",))
 

@@ -47,6 +47,7 @@ _METHOD = (
     "exact filter of a noise model that is fitted with it. The probabilities come from the evidence, calibrated on "
     "simulated cars."
 )
+_PROVISIONAL = "Provisional: the budget ended the search before all hypotheses were tried."
 _LIMITS = (
     "One effect or two, out of a table; a cause outside it may be attributed to the nearest effect.",
     "On a real car trust the order of the hypotheses and the alias set, not the third digit.",
@@ -88,10 +89,11 @@ def report_html(
         f"{log.name} · {log.seconds:.0f} s at {log.rate_hz:.3g} Hz",
         Section(
             sentences.headline(found),
-            (*odd, *_lead(found)),
+            (*odd, *(() if found.complete else (_PROVISIONAL,))),
             tuple(p for p in (_budget(found), _free_form(found), _drive(found), _road(found)) if p is not None),
         ),
         (
+            Section("In words", tuple(_words(found))),
             *(Section(title, tuple(lines)) for title, lines in (sections or {}).items()),
             Section(
                 "Where the gap lies",
@@ -155,14 +157,12 @@ def _one(picture: Picture | None) -> tuple[Picture, ...]:
 
 
 # the verdict -------------------------------------------------------------------------------------------------------
-def _lead(found: Diagnosis) -> list[str]:
+def _words(found: Diagnosis) -> list[str]:
     lines = [*sentences.tested(found), *sentences.budget(found), found.verdict.why, sentences.aliases(found)]
     lines += [*sentences.onset(found), *sentences.shrinkage(found)]
     if found.setting is not None:
         why = str(found.setting["why"])
         lines.append(why if why.startswith("Nothing to set") else f"To set: {why}")
-    if not found.complete:
-        lines.append("Provisional: the budget ended the search before all hypotheses were tried.")
     return lines
 
 

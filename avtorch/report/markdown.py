@@ -14,12 +14,13 @@ from avtorch.report.table import Table
 def markdown(page: Page, origin: Origin | None = None) -> str:
     """The page as Markdown; whatever a file's name holds stays text."""
     made = origin or Origin()
-    foot = [f"command: {made.command}"] if made.command else []
-    foot += [f"versions: {versions()}", *(f"SHA-256 of {name}: {digits}" for name, digits in made.files.items())]
+    command = (f"    {printable(made.command)}",) if made.command else ()
+    foot = [f"versions: {versions()}", *(f"SHA-256 of {name}: {digits}" for name, digits in made.files.items())]
     foot += [f"SHA-256 of the settings: {made.settings}"] if made.settings else []
     parts = [f"# {_text(page.kind)}", _text(page.of), f"**{_text(page.lead.title)}**", *_body(page.lead)]
-    for section in (*page.sections, Section("How this page was made", items=tuple(foot))):
+    for section in page.sections:
         parts += [] if section.empty else [f"## {_text(section.title)}", *_body(section)]
+    parts += ["## How this page was made", *command, *_body(Section("", items=tuple(foot)))]
     return "\n\n".join(parts) + "\n"
 
 
