@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import param
@@ -13,7 +14,7 @@ from panel.custom import JSComponent
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.report.page import text_of
 
-STYLES = [text_of("style.css"), text_of("app.css", "avtorch.app")]
+STYLES: list[Any] = [text_of("style.css"), text_of("app.css", "avtorch.app")]
 """The report's, and the workbench's own."""
 COLOURS = {"command": "#8f7fc0", "measured": "#868686", "simulator as it is": "#d0702c", "as set here": "#2f8bc4"}
 """Of the lines; each is seen on white and on black."""
@@ -95,9 +96,11 @@ class Chart:
             f'<span style="color: {COLOURS[x]}" aria-hidden="true">▬</span> {x}&ensp;' for x in names
         )
 
-    def _thin(self, values: FloatArray) -> FloatArray:
+    def _thin(self, values: FloatArray) -> Any:
         return np.insert(np.asarray(values, float)[self._keep], self._breaks, np.nan)
 
     def show(self, lines: Mapping[tuple[str, str], FloatArray]) -> None:
         """Other values (row,) for lines by quantity and name."""
-        self.source.data = dict(self.source.data) | {q + name: self._thin(x) for (q, name), x in lines.items()}
+        self.source.data = dict[str, Any](self.source.data) | {
+            q + name: self._thin(x) for (q, name), x in lines.items()
+        }

@@ -14,9 +14,8 @@ import panel as pn
 
 from avtorch.app.controls import STYLES, Chart, CheckBox, Slider
 from avtorch.app.task import Job, Task
-from avtorch.app.workplace import MOST_MB, Bench, examples
+from avtorch.app.workplace import MOST_MB, Workplace, examples
 from avtorch.errors import InputError, printable
-from avtorch.gap.quantity import words_of
 from avtorch.io import Log
 from avtorch.io.atomic import atomic
 from avtorch.io.formats import is_recording, open_recording
@@ -35,23 +34,22 @@ _WIDE: dict[str, Any] = {"sizing_mode": "stretch_width"}
 _TITLES = ("Which log?", "What does a simulator of this car lack?", "What has changed between two drives?")
 
 
-def page(bench: Bench) -> pn.template.Template:
+def page(place: Workplace) -> pn.template.Template:
     """What a tab shows, by its address: one or two of `log`, or an `example`; the folder of an `answer`."""
     args = {key: [x.decode("utf-8", "replace") for x in some] for key, some in pn.state.session_args.items()}
-    place, fault, view = bench.workplace, "", None
+    fault, view = "", None
     try:
         names = [place.example(x) for x in args.get("example", [])[:1]] or args.get("log", [])
         if len(names) > 2:
             raise InputError(f"Found {len(names)} logs, needs one, or two to compare")
         paths, answers = ([place.inside(x) for x in some[:2]] for some in (names, args.get("answer", [])))
-        view = View(bench, paths, answers[0] if answers else None) if paths else None
+        view = View(place, paths, answers[0] if answers else None) if paths else None
     except InputError as error:
         fault = str(error)
     template = pn.template.Template(text_of("page.html", "avtorch.app"))
-    known = {"folder": str(place.root), "start": f"/{bench.token}", "fault": fault, "most": MOST_MB}
-    known |= {"heading": _TITLES[len(view.paths) if view else 0], "logs": view is not None, "style": "\n".join(STYLES)}
-    known |= {"examples": examples(), "names": [] if view else place.logs()}
-    for key, value in known.items():
+    known = {"folder": str(place.root), "start": f"/{place.token}", "fault": fault, "most": MOST_MB, "view": view}
+    known |= {"heading": _TITLES[len(view.paths) if view else 0], "style": "\n".join(STYLES), "examples": examples()}
+    for key, value in (known | {"names": [] if view else place.logs()}).items():
         template.add_variable(key, value)
     template.add_panel("body", view.body if view else _html())
     return template
@@ -72,22 +70,21 @@ def _fault(text: object) -> str:
 class View:
     """One log, or two to compare; its run, and the answer."""
 
-    def __init__(self, bench: Bench, paths: list[Path], answer: Path | None) -> None:
-        self.bench, self.paths, self.names = bench, paths, [bench.workplace.name_of(x) for x in paths]
+    def __init__(self, place: Workplace, paths: list[Path], answer: Path | None) -> None:
+        self.place, self.paths, self.names = place, paths, [place.name_of(x) for x in paths]
         self.found: list[LogCheck] = []
         self.map: dict[str, str] = {}
         self.unit: dict[str, str] = {}
         self.drop_downs: dict[tuple[str, str], pn.widgets.Select] = {}
         self.job: Job | None = None
-        self._setting = False
+        self._setting = False  # the drop-downs, which is no choice of the user's
         what = "Diagnose" if len(paths) == 1 else "Compare"
         self.seen, self.status, self.columns = _html('<p role="status">Reading</p>'), _html(), pn.FlexBox(**_WIDE)
         self.chart, self.result = pn.Column(**_WIDE), pn.Column(**_WIDE)
         self.go = pn.widgets.Button(name=what, button_type="primary", disabled=True, stylesheets=STYLES)
         self.stop = pn.widgets.Button(name="Cancel", disabled=True, stylesheets=STYLES)
-        first = pn.Column(self.seen, self.columns, self.chart, styles=_CARD, **_WIDE)
-        run = pn.Column(pn.Row(self.go, self.stop), self.status, styles=_CARD, **_WIDE)
-        self.body = pn.Column(first, run, self.result, **_WIDE)
+        cards = [self.seen, self.columns, self.chart], [pn.Row(self.go, self.stop), self.status]
+        self.body = pn.Column(*(pn.Column(*each, styles=_CARD, **_WIDE) for each in cards), self.result, **_WIDE)
         self.go.on_click(self._start)
         self.stop.on_click(self.end)
         pn.state.on_session_destroyed(lambda session_context: self.end())
@@ -129,15 +126,13 @@ class View:
                 self._drop_down("unit", signal, _UNITS[signal], unit)
         self._setting = False
         self.columns[:] = list(self.drop_downs.values())
-        if found.log is None:
-            self.chart[:] = []
-            return
-        log, lines = found.log, {}
-        for quantity, given in (("acceleration [m/s²]", {"command": log.accel_cmd, "measured": log.accel}),
-                                ("speed [m/s]", {"measured": log.speed})):  # fmt: skip
-            lines |= {quantity: each} if (each := {k: x for k, x in given.items() if x is not None}) else {}
-        chart = Chart(log.elapsed, lines, log.segment)
-        self.chart[:] = [_html(f"<p>As read: {chart.legend}</p>"), *chart.figures]
+        self.chart[:] = []
+        if (log := found.log) is not None:
+            lines = {"acceleration [m/s²]": {"command": log.accel_cmd, "measured": log.accel}}
+            lines["speed [m/s]"] = {"measured": log.speed}
+            there = {key: {k: x for k, x in each.items() if x is not None} for key, each in lines.items()}
+            chart = Chart(log.elapsed, {key: each for key, each in there.items() if each}, log.segment)
+            self.chart[:] = [_html(f"<p>As read: {chart.legend}</p>"), *chart.figures]
 
     def _drop_down(self, kind: str, signal: str, options: list[str], value: str) -> None:
         """`kind`: map or unit."""
@@ -160,7 +155,7 @@ class View:
         return Task(self.names, out, **own, follower=self.found[0].follows)
 
     def _start(self, _: object) -> None:
-        place = self.bench.workplace
+        place = self.place
         try:
             for path, one in zip(self.paths, self.found, strict=True):
                 if one.proposal is not None and one.proposal.needed:
@@ -170,9 +165,9 @@ class View:
         except (InputError, OSError) as fault:
             self.status.object = _fault(fault)
             return
-        self.job, self.result[:] = Job(self._task(place.name_of(out)), place.root, self.bench.slots), []
+        self.job, self.result[:] = Job(self._task(place.name_of(out)), place.root, self.place.slots), []
         self.go.disabled, self.stop.disabled = True, False
-        self.polling = pn.state.add_periodic_callback(self._poll, period=400)
+        self.polling = pn.state.add_periodic_callback(self._poll, period=400)  # pyright: ignore[reportArgumentType]
 
     async def _poll(self) -> None:
         job = self.job
@@ -183,24 +178,25 @@ class View:
             return
         self.polling.stop()
         self.go.disabled, self.stop.disabled = False, True
-        out = self.bench.workplace.root / job.task.out
+        out = self.place.root / job.task.out
+        says = (
+            "Cancelled; nothing was written." if job.state == "cancelled" else f"Done; the answer is in {job.task.out}."
+        )
+        self.status.object = _fault(job.fault) if job.state == "failed" else f'<p role="status">{_safe(says)}</p>'
         if job.state == "done":
-            self.status.object = f'<p role="status">Done; the answer is in {_safe(job.task.out)}.</p>'
             await self._answer(out)
-            return
-        self.bench.workplace.give_up(out)
-        cancelled = '<p role="status">Cancelled; nothing was written.</p>'
-        self.status.object = cancelled if job.state == "cancelled" else _fault(job.fault)
+        else:
+            self.place.give_up(out)
 
     # the answer ------------------------------------------------------------------------------------------------------
     async def _answer(self, out: Path) -> None:
-        name, place = "report.html" if len(self.names) == 1 else "comparison.html", self.bench.workplace
+        name, place = "report.html" if len(self.names) == 1 else "comparison.html", self.place
         try:
             text = (out / name).read_text(encoding="utf-8")
         except OSError as fault:
             self.status.object = _fault(f"{out / name}: {fault.strerror}")
             return
-        task, where = self._task(place.name_of(out)), f"/{self.bench.token}/files/{place.name_of(out)}"
+        task, where = self._task(place.name_of(out)), f"/{self.place.token}/files/{place.name_of(out)}"
         lead = text[text.index('<section class="verdict') : text.index("</section>")] + "</section>"
         lead = lead.replace("h1", "h2").replace('aria-labelledby="verdict"', 'aria-label="Verdict"')
         files = sorted(p.name for p in out.iterdir() if p.is_file())
@@ -239,33 +235,23 @@ class Switches:
         self.add = pn.widgets.Select(name="Add an effect", options=["", *trial.addable()], stylesheets=STYLES)
         self.add.param.watch(self._added, "value")
         self._build({e.name for e in self.car.effects})
-        says = (
-            "<h2>Switch effects and see</h2><p>Switch an effect off, or move its size, and the simulator drives anew "
-        )
-        says += f"by the logged commands; a speed begins anew every 10 s. {self.chart.legend}</p>"
+        says = "<h2>Switch effects and see</h2><p>The simulator drives anew by the logged commands with each change; "
+        says += f"a speed begins anew every 10 s. {self.chart.legend}</p>"
         drawn = pn.Column(*self.chart.figures, min_width=260, styles={"flex": "1 1 26rem"}, **_WIDE)
         self.parts = [_html(says), self.error, pn.FlexBox(pn.Column(self.controls, self.add), drawn, **_WIDE)]
 
     def _build(self, on: set[str]) -> None:
-        self.boxes, self.sliders = {}, {}
-        rows: list[Any] = []
-        sizes = self.trial.sizes(self.car)
-        for effect in ("", *(e.name for e in self.car.effects)):
-            if effect:
-                chance = any(e.random for e in self.car.effects if e.name == effect)
-                label = f"{effect} (by chance; not in the rollout)" if chance else effect
-                self.boxes[effect] = CheckBox(label=label, value=effect in on)
-                rows.append(self.boxes[effect])
-            for key, x in sizes.items():
-                if key.rpartition(".")[0] == effect:
-                    words = f"{effect} {words_of(key.rpartition('.')[2])}".strip()
-                    self.sliders[key] = Slider(
-                        label=words, unit=x.unit.strip("-"), low=x.low, high=x.high, value=x.value
-                    )
-                    rows.append(self.sliders[key])
-        for control in (*self.boxes.values(), *self.sliders.values()):
+        chance = {"": "", **{e.name: " (by chance; not in the rollout)" if e.random else "" for e in self.car.effects}}
+        self.boxes = {x: CheckBox(label=x + chance[x], value=x in on) for x in chance if x}
+        self.sliders = {
+            key: Slider(label=key.replace(".", " ").rpartition("_")[0] or key, **_WIDE, **vars(size))
+            for key, size in self.trial.sizes(self.car).items()
+        }
+        rows = [*self.boxes.items(), *self.sliders.items()]
+        for _, control in rows:
             control.param.watch(self._moved, "value")
-        self.controls[:] = rows
+        # the simulator's own first, then each effect above its sizes
+        self.controls[:] = [x for effect in chance for key, x in rows if effect in (key, key.rpartition(".")[0])]
         self._moved()
 
     def _added(self, event: Any) -> None:
@@ -282,19 +268,15 @@ class Switches:
             self.error.object = _fault(fault)
             return
         self.chart.show({(q, "as set here"): x for q, x in zip(self.quantities, lines, strict=True)})
-        self.error.object = (
-            f'<p role="status">RMS error over 10 s: simulator as it is {_errors(self.base_errors)}; '
-            f"<strong>as set here {_errors(errors)}</strong>.</p>"
-        )
+        told = f"simulator as it is {_errors(self.base_errors)}; <strong>as set here {_errors(errors)}</strong>"
+        self.error.object = f'<p role="status">RMS error over 10 s: {told}.</p>'
 
 
 def _seen(name: str, found: LogCheck) -> str:
     """What the check saw of a log."""
-    text = f'<h2>{_safe(name)}</h2><p class="soft">{_safe(found.form)}</p>' + (
-        _fault(found.fault) if found.fault else ""
-    )
-    doubts = () if found.proposal is None else found.proposal.doubts
-    return text + "<ul>" + "".join(f"<li>{_safe(x)}</li>" for x in (*doubts, *found.notes)) + "</ul>"
+    says = [*(() if found.proposal is None else found.proposal.doubts), *found.notes]
+    head = f'<h2>{_safe(name)}</h2><p class="soft">{_safe(found.form)}</p>'
+    return f"{head}{_fault(found.fault) if found.fault else ''}<ul>{''.join(f'<li>{_safe(x)}</li>' for x in says)}</ul>"
 
 
 def _errors(errors: Mapping[str, float]) -> str:

@@ -6,13 +6,13 @@ import logging
 import mimetypes
 from typing import Any
 
-from avtorch.app.workplace import MOST_MB, Bench
+from avtorch.app.workplace import MOST_MB, Workplace
 from avtorch.errors import InputError
 
 ADDRESS = "127.0.0.1"
 
 
-def handlers(bench: Bench) -> list[tuple[str, type]]:
+def handlers(place: Workplace) -> list[tuple[str, type]]:
     """Routes beside the page's own: answers to read and to download, and uploads."""
     from tornado.web import HTTPError, RequestHandler, stream_request_body
 
@@ -23,15 +23,16 @@ def handlers(bench: Bench) -> list[tuple[str, type]]:
 
         def write_error(self, status_code: int, **kwargs: Any) -> None:
             self.set_header("Content-Type", "text/plain; charset=utf-8")
-            self.finish(str(getattr(kwargs.get("exc_info", (0, 0))[1], "log_message", "") or self._reason))
+            fault = kwargs.get("exc_info", (0, 0))[1]
+            self.finish(getattr(fault, "log_message", "") or getattr(fault, "strerror", "") or self._reason)
 
     class Answer(Route):
         def get(self, name: str) -> None:
             try:
-                path = bench.workplace.inside(name)
+                path = place.inside(name)
             except InputError:
                 raise HTTPError(404) from None
-            if not (path.is_file() and bench.workplace.name_of(path).startswith("out/")):
+            if not (path.is_file() and place.name_of(path).startswith("out/")):
                 raise HTTPError(404)
             kind = mimetypes.guess_type(path.name)[0] or "application/octet-stream"
             self.set_header("Content-Type", f"{kind}; charset=utf-8" if kind.startswith("text/") else kind)
@@ -50,22 +51,16 @@ def handlers(bench: Bench) -> list[tuple[str, type]]:
             if self.request.method != "PUT" or not length.isdecimal() or int(length) > MOST_MB * 2**20:
                 raise HTTPError(413, f"The file has over {MOST_MB} MB; needs fewer")
             self.request.connection.set_max_body_size(MOST_MB * 2**20)  # pyright: ignore
-            try:
-                self.path_here = bench.workplace.upload(self.path_args[0])
-                self.stream = self.path_here.open("xb")
-            except OSError as fault:
-                raise HTTPError(507, f"The file cannot be kept: {fault.strerror}") from None
+            self.path_here = place.upload(self.path_args[0])
+            self.stream = self.path_here.open("xb")
 
         def data_received(self, chunk: bytes) -> None:
-            try:
-                self.stream.write(chunk)
-            except OSError as fault:
-                raise HTTPError(507, f"The file cannot be kept: {fault.strerror}") from None
+            self.stream.write(chunk)
 
         def put(self, name: str) -> None:
             self.stream.close()
             self.stream = None
-            self.write(bench.workplace.name_of(self.path_here))
+            self.write(place.name_of(self.path_here))
 
         def on_finish(self) -> None:
             if self.stream is not None:  # what did not come whole is no log
@@ -74,10 +69,10 @@ def handlers(bench: Bench) -> list[tuple[str, type]]:
 
         on_connection_close = on_finish
 
-    return [(rf"/{bench.token}/files/(.+)", Answer), (rf"/{bench.token}/upload/(.+)", Upload)]
+    return [(rf"/{place.token}/files/(.+)", Answer), (rf"/{place.token}/upload/(.+)", Upload)]
 
 
-def server_of(bench: Bench, port: int = 0) -> tuple[Any, str]:
+def server_of(place: Workplace, port: int = 0) -> tuple[Any, str]:
     """The server, not started, and the address of its page. `port` 0: a free one.
 
     Raises `InputError` where the port is taken, and without the extra `app`.
@@ -88,22 +83,20 @@ def server_of(bench: Bench, port: int = 0) -> tuple[Any, str]:
         raise InputError("avtorch app: needs Panel; pip install 'avtorch[app]'") from None
     from avtorch.app.page import page
 
-    for name in ("bokeh", "tornado.access", "panel"):  # a terminal is for what went wrong
-        logging.getLogger(name).setLevel(logging.ERROR)
+    logging.getLogger("tornado.access").setLevel(logging.ERROR)  # what is not there is answered, not logged
     try:
         server = get_server(
-            {bench.token: lambda: page(bench)},
+            {place.token: lambda: page(place)},
             port=port,
             address=ADDRESS,
             websocket_origin=None if port == 0 else [f"{ADDRESS}:{port}"],
             title="avtorch workbench",
             redirect_root=False,
             use_index=False,
-            extra_patterns=handlers(bench),
-            # a tab that was closed ends its run soon
-            unused_session_lifetime_milliseconds=15_000,
+            extra_patterns=handlers(place),
+            unused_session_lifetime_milliseconds=15_000,  # a tab that was closed ends its run soon
             check_unused_sessions_milliseconds=3_000,
         )
     except OSError as fault:
         raise InputError(f"--port: {port} cannot be used ({fault.strerror}); needs a free one, or none") from None
-    return server, f"http://{ADDRESS}:{server.port}/{bench.token}"
+    return server, f"http://{ADDRESS}:{server.port}/{place.token}"

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Literal
 
 _PERCENT = re.compile(r"(\d+) %")
-_GRACE_S = 5.0  # for an interrupted command to end by itself
 
 
 @dataclass(frozen=True)
@@ -55,8 +54,7 @@ class Task:
         if len(self.logs) == 2:
             return f"import avtorch\n\nprint(avtorch.compare({own}))"
         if self.follower:
-            read = "from avtorch.follower import diagnose_follower\nfrom avtorch.io import read_following"
-            return f"{read}\n\nprint(diagnose_follower(read_following({own})))"
+            return f"from avtorch import follower, io\n\nprint(follower.diagnose_follower(io.read_following({own})))"
         return (
             "import avtorch\nfrom avtorch.report import write_report\n\n"
             f'found = avtorch.diagnose({own}, posterior="sgld")\n'
@@ -118,4 +116,4 @@ class Job:
             process = self._process
         if process is not None and process.poll() is None:
             process.send_signal(signal.SIGINT) if os.name == "posix" else process.terminate()
-            threading.Timer(_GRACE_S, lambda: process.kill() if process.poll() is None else None).start()
+            threading.Timer(5.0, lambda: process.kill() if process.poll() is None else None).start()

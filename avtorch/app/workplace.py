@@ -7,7 +7,8 @@ import re
 import secrets
 import shutil
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import count, islice
 from pathlib import Path
 
@@ -22,9 +23,12 @@ _LAP = Path("genesis") / "lap1.csv"
 
 @dataclass(frozen=True)
 class Workplace:
-    """A folder; `root` is absolute, without symbolic links."""
+    """What the tabs of a server share: the folder `root`, absolute and without symbolic links; the `token` of its
+    address; `slots`, of which each command that runs takes one."""
 
     root: Path
+    token: str = field(default_factory=partial(secrets.token_urlsafe, 32))
+    slots: threading.Semaphore = field(default_factory=partial(threading.Semaphore, max(1, (os.cpu_count() or 2) // 2)))
 
     @classmethod
     def of(cls, folder: Path) -> Workplace:
@@ -68,16 +72,13 @@ class Workplace:
         """A new folder for an answer: `out/NAME`, or `out/NAME-2` where that is taken. Raises `InputError` where it
         cannot be made."""
         stem = re.sub(r"[^\w+-]", "_", Path(log).name.partition(".")[0]) or "log"
-        for number in count(1):
-            path = self.root / "out" / (stem if number == 1 else f"{stem}-{number}")
-            try:
-                path.mkdir(parents=True)
-                return path
-            except FileExistsError:
-                continue
-            except OSError as fault:
-                raise InputError(f"{path}: cannot be made ({fault.strerror}); start the workbench elsewhere") from None
-        raise AssertionError("count has no end")
+        names = (stem if n == 1 else f"{stem}-{n}" for n in count(1))
+        path = next(path for name in names if not (path := self.root / "out" / name).exists())
+        try:
+            path.mkdir(parents=True)  # another tab's at this very moment is an error, too
+        except OSError as fault:
+            raise InputError(f"{path}: cannot be made ({fault.strerror}); start the workbench elsewhere") from None
+        return path
 
     def give_up(self, folder: Path) -> None:
         """Remove the folder of an answer that did not come."""
@@ -101,17 +102,8 @@ class Workplace:
         return self.name_of(path)
 
 
-class Bench:
-    """What the tabs of a server share: the folder, the token, and how many commands may run at once."""
-
-    def __init__(self, workplace: Workplace) -> None:
-        self.workplace, self.token = workplace, secrets.token_urlsafe(32)
-        self.slots = threading.Semaphore(max(1, (os.cpu_count() or 2) // 2))
-
-
 def examples() -> dict[str, str]:
-    """Examples by name, with what they are. No recording comes with avtorch: the recorded one is there where
-    `AVTORCH_DATA` names the folder that holds it."""
+    """Examples by name, with what they are; the recorded one, which does not come with avtorch, from `AVTORCH_DATA`."""
     told = {"simulated": "commands act 0.3 s late and the accelerometer reads 0.15 m/s² too much; are both found?"}
     folder = os.environ.get("AVTORCH_DATA")
     if folder and (Path(folder) / _LAP).is_file():

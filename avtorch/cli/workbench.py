@@ -28,11 +28,11 @@ def workbench(
         The folder with your logs; nothing outside it is read. Answers go to its folder out.
     """
     from avtorch.app.serve import server_of
-    from avtorch.app.workplace import Bench, Workplace
+    from avtorch.app.workplace import Workplace
 
     if not 0 <= port < 65536:
         raise InputError(f"--port: found {port}, needs a number from 1 to 65535")
-    server, address = server_of(Bench(Workplace.of(folder)), port)
+    server, address = server_of(Workplace.of(folder), port)
     server.start()
     print(f"The workbench is at {address}\nOnly this address opens it. Ctrl-C ends it.", flush=True)
     if open_page:

@@ -78,7 +78,7 @@ class Trial:
                 value = float(values[key])
                 ends = [p.low, p.high, value, 0.6 * value, 1.4 * value, *([] if p.neutral is None else [p.neutral])]
                 known = [x for x in ends if np.isfinite(x)]
-                out[key] = Size(value, min(known), max(known), p.unit)
+                out[key] = Size(value, min(known), max(known), "" if p.unit == "-" else p.unit)
         return out
 
     def addable(self) -> list[str]:

@@ -10,23 +10,23 @@ from pathlib import Path
 import pytest
 
 from avtorch.app import serve
-from avtorch.app.workplace import Bench, Workplace
+from avtorch.app.workplace import Workplace
 from avtorch.errors import InputError
 
 pytest.importorskip("panel")
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Bench:
+def place(tmp_path: Path) -> Workplace:
     (tmp_path / "out" / "drive").mkdir(parents=True)
     (tmp_path / "out" / "drive" / "report.html").write_text("<p>a report</p>")
     (tmp_path / "out" / "drive" / "plant.toml").write_text("T_L = 0.3")
     (tmp_path / "drive.csv").write_text("time,speed\n")
-    return Bench(Workplace.of(tmp_path))
+    return Workplace.of(tmp_path)
 
 
 @pytest.fixture
-def port(bench: Bench) -> Iterator[int]:
+def port(place: Workplace) -> Iterator[int]:
     """A server of the routes beside the page, in a thread."""
     import asyncio
 
@@ -39,7 +39,7 @@ def port(bench: Bench) -> Iterator[int]:
     loop = asyncio.new_event_loop()
 
     async def run() -> None:
-        server = HTTPServer(Application(serve.handlers(bench)))
+        server = HTTPServer(Application(serve.handlers(place)))
         server.add_socket(socket)
         await ended.wait()
         server.stop()
@@ -62,11 +62,11 @@ def ask(port: int, method: str, path: str, body: bytes | None = None) -> tuple[i
     return answer.status, text, dict(answer.getheaders())
 
 
-def test_a_report_is_read_and_a_file_is_downloaded(port: int, bench: Bench) -> None:
-    status, text, headers = ask(port, "GET", f"/{bench.token}/files/out/drive/report.html")
+def test_a_report_is_read_and_a_file_is_downloaded(port: int, place: Workplace) -> None:
+    status, text, headers = ask(port, "GET", f"/{place.token}/files/out/drive/report.html")
     assert (status, text) == (200, "<p>a report</p>")
     assert headers["X-Content-Type-Options"] == "nosniff"
-    _, _, headers = ask(port, "GET", f"/{bench.token}/files/out/drive/plant.toml")
+    _, _, headers = ask(port, "GET", f"/{place.token}/files/out/drive/plant.toml")
     assert headers["Content-Disposition"] == 'attachment; filename="plant.toml"'
 
 
@@ -83,35 +83,35 @@ def test_a_report_is_read_and_a_file_is_downloaded(port: int, bench: Bench) -> N
         "/{token}/files/out/%2e%2e/drive.csv",
     ],
 )
-def test_nothing_else_is_served(port: int, bench: Bench, path: str) -> None:
-    assert ask(port, "GET", path.format(token=bench.token))[0] == 404
+def test_nothing_else_is_served(port: int, place: Workplace, path: str) -> None:
+    assert ask(port, "GET", path.format(token=place.token))[0] == 404
 
 
-def test_an_upload_is_kept_under_out(port: int, bench: Bench) -> None:
-    status, text, _ = ask(port, "PUT", f"/{bench.token}/upload/..%2F..%2Fmy%20log.csv", b"time,speed\n0,1\n")
+def test_an_upload_is_kept_under_out(port: int, place: Workplace) -> None:
+    status, text, _ = ask(port, "PUT", f"/{place.token}/upload/..%2F..%2Fmy%20log.csv", b"time,speed\n0,1\n")
     assert (status, text) == (200, "out/logs/my log.csv")
-    assert (bench.workplace.root / text).read_bytes() == b"time,speed\n0,1\n"
+    assert (place.root / text).read_bytes() == b"time,speed\n0,1\n"
     assert ask(port, "PUT", "/wrong/upload/log.csv", b"x")[0] == 404
 
 
 def test_too_large_a_file_is_refused_before_it_is_read(
-    port: int, bench: Bench, monkeypatch: pytest.MonkeyPatch
+    port: int, place: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(serve, "MOST_MB", 0)
-    status, text, _ = ask(port, "PUT", f"/{bench.token}/upload/log.csv", b"x")
+    status, text, _ = ask(port, "PUT", f"/{place.token}/upload/log.csv", b"x")
     assert (status, text) == (413, "The file has over 0 MB; needs fewer")
-    assert not (bench.workplace.root / "out" / "logs").exists()
+    assert not (place.root / "out" / "logs").exists()
 
 
-def test_half_an_upload_is_no_log(port: int, bench: Bench) -> None:
+def test_half_an_upload_is_no_log(port: int, place: Workplace) -> None:
     import socket
     import time
 
     with socket.create_connection((serve.ADDRESS, port)) as half:
         half.sendall(
-            f"PUT /{bench.token}/upload/log.csv HTTP/1.1\r\nHost: x\r\nContent-Length: 100\r\n\r\nhalf".encode()
+            f"PUT /{place.token}/upload/log.csv HTTP/1.1\r\nHost: x\r\nContent-Length: 100\r\n\r\nhalf".encode()
         )
-        folder = bench.workplace.root / "out" / "logs"
+        folder = place.root / "out" / "logs"
         for _ in range(100):
             if folder.exists() and list(folder.iterdir()):
                 break
@@ -125,7 +125,7 @@ def test_half_an_upload_is_no_log(port: int, bench: Bench) -> None:
 
 
 def test_tokens_are_long_and_differ(tmp_path: Path) -> None:
-    tokens = {Bench(Workplace.of(tmp_path)).token for _ in range(10)}
+    tokens = {Workplace.of(tmp_path).token for _ in range(10)}
     assert len(tokens) == 10
     assert min(map(len, tokens)) >= 43  # 256 bits
 
@@ -133,16 +133,16 @@ def test_tokens_are_long_and_differ(tmp_path: Path) -> None:
 # Bokeh leaves the socket that it could not bind to the collector
 @pytest.mark.filterwarnings("ignore:Exception ignored in. <socket:pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.filterwarnings("ignore:unclosed <socket:ResourceWarning")
-def test_it_listens_on_this_machine_alone(bench: Bench) -> None:
-    server, address = serve.server_of(bench)
-    assert address == f"http://127.0.0.1:{server.port}/{bench.token}"
+def test_it_listens_on_this_machine_alone(place: Workplace) -> None:
+    server, address = serve.server_of(place)
+    assert address == f"http://127.0.0.1:{server.port}/{place.token}"
     assert {s.getsockname()[0] for s in server._http._sockets.values()} == {"127.0.0.1"}
     with pytest.raises(InputError, match="cannot be used"):
-        serve.server_of(bench, server.port)
+        serve.server_of(place, server.port)
     server.stop()
 
 
-def test_without_the_extra_one_line_says_what_to_install(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_one_line_says_what_to_install(place: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "panel.io.server", None)
     with pytest.raises(InputError, match=r"pip install 'avtorch\[app\]'"):
-        serve.server_of(bench)
+        serve.server_of(place)
