@@ -28,6 +28,7 @@ from avtorch.cli.run import run
 from avtorch.cli.stability import stability
 from avtorch.cli.validate import validate
 from avtorch.cli.watch import watch
+from avtorch.cli.workbench import workbench
 from avtorch.errors import InputError, printable
 from avtorch.version import __version__
 
@@ -77,6 +78,7 @@ for _command in (check, check_simulator, watch):
     app.command(_command)
 for _command in (run, estimate, diagnose, compare, fleet, stability, validate, paper):
     app.command(alone_in_out(_command))
+app.command(workbench, name="app")
 
 
 def _missing(fault: MissingArgumentError) -> str:

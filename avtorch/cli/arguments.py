@@ -58,6 +58,9 @@ Stamps = Annotated[
     list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
 ]
 Open = Annotated[bool, Parameter(name="--open", negative=(), group=OUTPUT, help="Show the page in your browser.")]
+Verbose = Annotated[
+    bool, Parameter(name=("--verbose", "-v"), negative=(), group=OUTPUT, help="Print all that was found.")
+]
 Json = Annotated[bool, Parameter(name="--json", negative=(), group=OUTPUT, help="Print the answer as JSON, no tables.")]
 Quiet = Annotated[bool, Parameter(name=("--quiet", "-q"), negative=(), group=OUTPUT, help="Print nothing but errors.")]
 Seed = Annotated[int, Parameter(name="--seed", converter=whole_number, help="Seed of everything random.")]

@@ -20,6 +20,7 @@ from avtorch.cli.arguments import (
     Seed,
     Stamps,
     Units,
+    Verbose,
     free_folder,
     local_folder,
     origin_of,
@@ -124,6 +125,10 @@ def diagnose(
             help="estimates.json of avtorch estimate on the same log, whose alarms the report marks; one for each log.",
         ),
     ] = None,
+    credibility: Annotated[
+        bool,
+        Parameter(negative=(), group=OUTPUT, help="Also write credibility.html and .md, the evidence for an assessor."),
+    ] = False,
     follower: Annotated[
         bool, Parameter(group=FOLLOWER, negative=(), help="The log is of a car that follows, and has no accel_cmd.")
     ] = False,
@@ -149,6 +154,7 @@ def diagnose(
     seconds: Annotated[float | None, Parameter(group=TRACK, help="Duration [s]; default: 60.")] = None,
     seed: Seed = 0,
     open_page: Open = False,
+    verbose: Verbose = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -197,13 +203,24 @@ def diagnose(
         }
         idle = {"simulated": simulated, "simulator": simulator, "step": step is not None, "adjust": adjust}
         idle |= {"estimates": estimates, "rollouts": rollouts is not None, "processes": processes != 1}
-        idle |= {"baseline": assumed, "prior": weights, "budget": budget is not None}
+        idle |= {"credibility": credibility, "baseline": assumed, "prior": weights, "budget": budget is not None}
         idle |= {option: not default for option, default in usual.items()}
         refuse(logs, **idle, **{option: value is not None for option, value in track.items()})
         source = {"map": map, "unit": unit, "stamp": stamp, "vehicle": vehicle, "event": event}
         origin = origin_of(logs, **source, law=law, effects=chosen, seed=seed)
         with talk.progress("Diagnosing") as done:
-            follow(talk, logs[0], out, source=source, law=law, effects=chosen, seed=seed, step=done, origin=origin)
+            follow(
+                talk,
+                logs[0],
+                out,
+                source=source,
+                law=law,
+                effects=chosen,
+                seed=seed,
+                step=done,
+                origin=origin,
+                verbose=verbose,
+            )
         if open_page:
             talk.show(out / "report.html")
         return
@@ -225,7 +242,8 @@ def diagnose(
     quality = []
     for drive in drives:
         noted = check(drive).notes
-        talk.notes(f"{drive.name}", noted)
+        if verbose:
+            talk.notes(drive.name, noted)
         quality += [f"{Path(drive.name).name}: {note}" for note in noted]
 
     origin = origin_of(
@@ -272,7 +290,7 @@ def diagnose(
     from avtorch.experiment import next_experiment, write_table
     from avtorch.gap.result.diagnosis import DIAGNOSIS_FILES
     from avtorch.io import answer_set
-    from avtorch.report import write_report
+    from avtorch.report import write_credibility, write_report
 
     notes = found.notes if fit is None else (*found.notes, about_map)
     try:
@@ -291,22 +309,13 @@ def diagnose(
         written = [*found.write(staged), *write_table(ahead, staged)]
         written += write_exports(found.plant, staged, pedals=pedals)
         written.append(write_report(found, staged, quality=quality, experiment=ahead, origin=origin))
+        written += write_credibility(found, staged, quality=quality, origin=origin) if credibility else []
         written += write_pedals(fit, staged)
     if open_page:
         talk.show(out / "report.html")
     if not talk.json:
-        print_diagnosis(talk, found)
-    talk.done(out, found.to_dict(), [p.name + _FILES.get(p.name, _FILES.get(p.suffix, "")) for p in written])
-
-
-_FILES = {
-    ".toml": " (the repaired simulator)",
-    "manoeuvre.csv": " (what to drive next)",
-    ".csv": " (the map of the commands)",
-    ".yaml": " (in that tool's terms)",
-    ".xml": " (in that tool's terms)",
-    ".html": " (to read)",
-}
+        print_diagnosis(talk, found, verbose=verbose)
+    talk.done(out, found.to_dict(), files=[p.name for p in written])
 
 
 def _limits(drives: Sequence[Log], given: Mapping[str, float | None]) -> Limits:

@@ -37,6 +37,7 @@ def follow(
     seed: int,
     step: Callable[[str, int, int], None],
     origin: Origin,
+    verbose: bool,
 ) -> None:
     """Diagnose the follower, write the answer and the page, and print a summary.
 
@@ -51,7 +52,8 @@ def follow(
 
     log = read_following(path, **source)
     noted = [*check(log).notes, *log.remarks]
-    talk.notes(log.name, noted)
+    if verbose:
+        talk.notes(log.name, noted)
     found = diagnose_follower(log, law=law, effects=effects, seed=seed, progress=step)
     gap = found.diagnosis
     assert gap is not None
@@ -67,8 +69,8 @@ def follow(
         talk.line("")
         talk.table(_table(found.parameters))
         talk.line("Conditional on that law, on the held-out half of the drive:")
-        print_diagnosis(talk, gap, tables=False)
-    talk.done(out, answer, [p.name for p in written])
+        print_diagnosis(talk, gap, verbose=verbose)
+    talk.done(out, answer, files=[p.name for p in written])
 
 
 def _table(parameters: Mapping[str, Any]) -> Table:
@@ -82,8 +84,8 @@ def _table(parameters: Mapping[str, Any]) -> Table:
     return Table("The loop", ("of the loop", "mean", "90 %"), rows)
 
 
-def print_diagnosis(talk: Talk, found: Diagnosis, *, tables: bool = True) -> None:
-    """The verdict in one sentence and its reason, the page's tables, and a few lines below."""
+def print_diagnosis(talk: Talk, found: Diagnosis, *, verbose: bool = False) -> None:
+    """The verdict in one sentence and one table; the page's other sentences and tables where `verbose`."""
     from avtorch.gap.result import sentences
     from avtorch.report.diagnosis_tables import budget_table, candidate_table
 
@@ -91,17 +93,21 @@ def print_diagnosis(talk: Talk, found: Diagnosis, *, tables: bool = True) -> Non
     known = {"unknown": "bold yellow", "none": "bold green"}
     talk.lines([sentences.headline(found)], "bold yellow" if odd else known.get(found.verdict.name, "bold cyan"))
     talk.lines(odd, "yellow")
-    talk.lines([*sentences.tested(found), *sentences.budget(found)])
-    talk.lines([found.verdict.why], "dim")
-    talk.line("")
-    if tables and found.budget is not None and found.budget.says_something:
-        talk.table(budget_table(found.budget, found.log.epochs_s[0]))
-    if tables:
-        talk.table(candidate_table(found, most=8))
-    talk.lines([sentences.aliases(found), *sentences.onset(found), *sentences.where(found), *sentences.moved(found)])
-    talk.lines([*sentences.gap(found), *sentences.shrinkage(found), *sentences.to_set(found)])
-    talk.lines([*sentences.to_drive(found), *sentences.remains(found)])
     if not found.complete:
         text = "The budget ended the search: the answer is provisional; give the command a larger one."
         talk.lines([text], "yellow")
-    talk.lines([note for note in found.notes if found.complete or "budget" not in note], "dim")
+    if verbose:
+        talk.lines([*sentences.tested(found), *sentences.budget(found)])
+        talk.lines([found.verdict.why], "dim")
+    talk.line("")
+    divided = found.budget is not None and found.budget.says_something
+    if found.budget is not None and divided:
+        talk.table(budget_table(found.budget, found.log.epochs_s[0]))
+    if verbose or not divided:
+        talk.table(candidate_table(found, most=8 if verbose else 5))
+    if verbose:
+        talk.lines([sentences.aliases(found), *sentences.onset(found), *sentences.where(found)])
+        talk.lines([*sentences.moved(found), *sentences.gap(found), *sentences.shrinkage(found)])
+        talk.lines([*sentences.to_set(found), *sentences.to_drive(found), *sentences.remains(found)])
+        talk.lines([note for note in found.notes if found.complete or "budget" not in note], "dim")
+        talk.line("")

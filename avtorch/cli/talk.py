@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 import webbrowser
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -21,8 +22,9 @@ from avtorch.errors import printable
 if TYPE_CHECKING:
     from avtorch.report.table import Table
 
-EVERY_S = 10.0
-"""Wall-clock time between two lines of progress [s]; a command that takes less prints none."""
+EVERY_S = float(os.environ.get("AVTORCH_PROGRESS_S", 10.0))
+"""Wall-clock time between two lines of progress [s]; a command that takes less prints none. A program that starts the
+command may ask for more of them."""
 
 
 class SafeConsole(Console):
@@ -148,21 +150,41 @@ class Talk:
         if not webbrowser.open(page.absolute().as_uri()):
             self.line(f"No browser was found to open {page}")
 
-    def done(self, out: Path, answer: Mapping[str, Any], names: Iterable[str] = ()) -> None:
-        """The answer as JSON, or where its files are: `names`, or all that a reader opens."""
+    def done(
+        self, out: Path, answer: Mapping[str, Any], names: Iterable[str] = (), *, files: Iterable[str] = ()
+    ) -> None:
+        """The answer as JSON, or where its files are: `names`, or all that a reader opens; a line each for `files`."""
         if self.json:
             self.answer(answer)
+            return
+        if files:
+            for name in files:
+                says = _FILES.get(name, _FILES.get(Path(name).suffix, ""))
+                self.out.print(f"[bold]{escape(str(out / name))}[/bold]{says and '  '}{says}", soft_wrap=True)
             return
         kinds = (".html", ".json", ".png")
         there = names or sorted(p.name for p in out.iterdir() if p.suffix in kinds and p.is_file())
         self.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {escape(', '.join(there))}", soft_wrap=True)
 
 
+_FILES = {
+    "report.html": "to read",
+    "credibility.html": "the evidence for an assessor",
+    "credibility.md": "the same to paste",
+    "plant.toml": "the repaired simulator",
+    "manoeuvre.csv": "what to drive next",
+    ".csv": "the map of the commands",
+    ".json": "all numbers",
+    ".yaml": "in that tool's terms",
+    ".xml": "in that tool's terms",
+}
+"""What a file of a diagnosis holds, by its name or its suffix."""
+
+
 def drawn(table: Table, most: int | None = None) -> Drawn:
     """A table of the page for the terminal, without the columns in which nothing stands."""
     shown = Drawn(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
-    told = [i for i, title in enumerate(table.columns) if title not in table.page_only]
-    kept = [i for i in told if i == 0 or any(row[i] for row in table.rows)]
+    kept = [i for i in range(len(table.columns)) if i == 0 or any(row[i] for row in table.rows)]
     # a name is not cut, so that it can be copied
     longest = max((len(word) for row in table.rows[:most] for word in row[0].split()), default=None)
     for i in kept:

@@ -5,12 +5,15 @@ from avtorch.experiment.next_experiment import Experiment, next_experiment, writ
 from avtorch.experiment.prediction import Information as Information
 from avtorch.experiment.prediction import ManoeuvrePrediction as ManoeuvrePrediction
 from avtorch.experiment.prediction import information as information
+from avtorch.experiment.ranking import RankAgreement, rank_agreement
 
 __all__ = [
     "Experiment",
     "Limits",
     "Manoeuvre",
+    "RankAgreement",
     "library",
     "next_experiment",
+    "rank_agreement",
     "write_table",
 ]

@@ -99,7 +99,8 @@ def rms(record: Counted, errors: FloatArray, lag: float) -> dict[str, float]:
     squares = block_squares(record, errors, [slice(a, b) for a, b in pairwise(edges)], lag, HORIZON_S)
     rows = record.rows * record.group
     return {
-        channel: float(np.sqrt(x.sum() / rows)) for channel, x in zip(record.channels, squares.values(), strict=True)
+        channel: float(np.sqrt(max(x.sum(), 0.0) / rows))
+        for channel, x in zip(record.channels, squares.values(), strict=True)
     }
 
 

@@ -6,9 +6,11 @@ from avtorch.remedy.exports import Exported as Exported
 from avtorch.remedy.exports import SumoType as SumoType
 from avtorch.remedy.exports import to_autoware, to_carla, to_openpilot, to_sumo, write_exports
 from avtorch.remedy.linearised import linearised as linearised
+from avtorch.remedy.trial import Trial
 from avtorch.remedy.what_to_set import WhatToSet, setting_for, what_to_set
 
 __all__ = [
+    "Trial",
     "WhatToSet",
     "setting_for",
     "to_autoware",

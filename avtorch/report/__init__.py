@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from avtorch.report.comparison import comparison_html, write_comparison_page
+    from avtorch.report.credibility import credibility_page, write_credibility
     from avtorch.report.diagnosis import report_html, write_report
     from avtorch.report.estimates import estimates_html, write_estimates_page
     from avtorch.report.fleet import fleet_html, write_fleet_page
@@ -20,12 +21,14 @@ if TYPE_CHECKING:
 __all__ = [
     "Origin",
     "comparison_html",
+    "credibility_page",
     "estimates_html",
     "fleet_html",
     "report_html",
     "run_html",
     "validation_html",
     "write_comparison_page",
+    "write_credibility",
     "write_estimates_page",
     "write_fleet_page",
     "write_report",
@@ -33,11 +36,18 @@ __all__ = [
     "write_validation_page",
 ]
 
-_HOME = {"Origin": "origin", "report_html": "diagnosis", "write_report": "diagnosis"} | {
-    name: kind
-    for kind in ("comparison", "estimates", "fleet", "run", "validation")
-    for name in (f"{kind}_html", f"write_{kind}_page")
-}
+_HOME = (
+    {"Origin": "origin", "report_html": "diagnosis", "write_report": "diagnosis"}
+    | {
+        "credibility_page": "credibility",
+        "write_credibility": "credibility",
+    }
+    | {
+        name: kind
+        for kind in ("comparison", "estimates", "fleet", "run", "validation")
+        for name in (f"{kind}_html", f"write_{kind}_page")
+    }
+)
 
 
 def __getattr__(name: str) -> Any:

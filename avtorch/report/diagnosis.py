@@ -48,6 +48,7 @@ _METHOD = (
     "are compared in short frames and bands of frequency, in each of which the noise is free. The probabilities come "
     "from the evidence, tempered on simulated cars."
 )
+_PROVISIONAL = "Provisional: the budget ended the search before all hypotheses were tried."
 _LIMITS = (
     "Effects out of a table, some at once; a cause outside it may be attributed to the nearest effect, or to two.",
     "On a real car trust the order of the hypotheses and the alias set, not the third digit.",
@@ -90,10 +91,11 @@ def report_html(
         f"{log.name} · {log.seconds:.0f} s at {log.rate_hz:.3g} Hz",
         Section(
             sentences.headline(found),
-            (*odd, *_lead(found)),
+            (*odd, *(() if found.complete else (_PROVISIONAL,))),
             tuple(p for p in (_budget(found), _free_form(found), _drive(found), _road(found)) if p is not None),
         ),
         (
+            Section("In words", tuple(_words(found))),
             *(Section(title, tuple(lines)) for title, lines in (sections or {}).items()),
             Section(
                 "Where the gap lies",
@@ -157,14 +159,12 @@ def _one(picture: Picture | None) -> tuple[Picture, ...]:
 
 
 # the verdict -------------------------------------------------------------------------------------------------------
-def _lead(found: Diagnosis) -> list[str]:
+def _words(found: Diagnosis) -> list[str]:
     lines = [*sentences.tested(found), *sentences.budget(found), found.verdict.why, sentences.aliases(found)]
     lines += [*sentences.onset(found), *sentences.shrinkage(found)]
     if found.setting is not None:
         why = str(found.setting["why"])
         lines.append(why if why.startswith("Nothing to set") else f"To set: {why}")
-    if not found.complete:
-        lines.append("Provisional: the budget ended the search before all hypotheses were tried.")
     return lines
 
 

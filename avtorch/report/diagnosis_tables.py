@@ -45,7 +45,7 @@ def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
             ("unexplained", budget_parts.percent(rest), "", places, ""),
             ("noise", budget_parts.percent(1.0 - rest), "", "", ""),
         ]
-    return Table("The gap's budget", columns, tuple(rows), numeric=("probability",), page_only=columns[-1:])
+    return Table("The gap's budget", columns, tuple(rows), numeric=("probability",))
 
 
 def family_table(budget: Budget) -> Table | None:

@@ -181,9 +181,9 @@ def fragment(template: str, **values: Any) -> Markup:
     return Markup(_template(template).render(**values))
 
 
-def text_of(name: str) -> str:
-    """A file of this package."""
-    return files("avtorch.report").joinpath(name).read_text(encoding="utf-8")
+def text_of(name: str, package: str = "avtorch.report") -> str:
+    """A file of a package, by default this one."""
+    return files(package).joinpath(name).read_text(encoding="utf-8")
 
 
 def _template(name: str) -> Any:

@@ -13,8 +13,7 @@ class Table:
     """`columns` (column,) of titles; `rows` (row,) of as many cells, the first of which names its row.
 
     `caption`: what the table shows. `numeric`: titles of the columns of numbers. `marked`: numbers of the rows in bold;
-    `soft`: of those that a terminal dims. `page_only`: titles of columns that a terminal leaves out: its sentences say
-    the same.
+    `soft`: of those that a terminal dims.
     Raises `InputError` where a row has another number of cells than there are columns.
 
     Example:
@@ -29,7 +28,6 @@ class Table:
     numeric: Collection[str] = ()
     marked: Collection[int] = ()
     soft: Collection[int] = ()
-    page_only: Collection[str] = ()
 
     def __post_init__(self) -> None:
         for i, row in enumerate(self.rows):

@@ -119,17 +119,25 @@ def test_files_and_words(
     assert main(["diagnose", drive, other, "--out", str(out)]) == 0
     told = capsys.readouterr()
     assert told.err == ""
+    sentence, table = told.out.split("\n\n")[:2]
+    assert "The simulator lacks this (probability 0.93): commands act" in " ".join(sentence.split())
+    assert table.split()[0] == "hypothesis"
+    files = [line.split("  ")[0] for line in told.out.splitlines() if line.startswith(str(out))]
+    assert sorted(files) == sorted(str(path) for path in out.iterdir())  # a line each
+    assert f"{out / 'plant.toml'}  the repaired simulator" in told.out
+    assert "T_L 0.52" not in told.out
+    assert main(["diagnose", drive, other, "--out", str(out), "--verbose"]) == 0
+    told = capsys.readouterr()
     assert "drive.csv" in told.out
     assert "other.csv" in told.out
-    assert "The simulator lacks this (probability 0.93): commands act" in told.out
     assert "T_L 0.52 → 0.31 s, K_L 1.02 → 0.99" in told.out
-    assert "diagnosis.json, plant.toml (the repaired simulator)" in told.out
     written = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
     assert written["schema"] == "avtorch.diagnosis/1"  # as its stand-in for the search has no budget
     assert written["log"]["rows"] == 2 * ROWS
     repaired = GapPlant.from_toml((out / "plant.toml").read_text(encoding="utf-8"))
     assert float(repaired.values()["dead_time.delay_s"]) == 0.182
-    (call,) = search.calls
+    call, again = search.calls
+    assert again.keys() == call.keys()
     assert [log.name for log in call.pop("logs")] == [drive, other]
     assert call == {
         "material": 0.03,
@@ -242,7 +250,7 @@ def test_a_manoeuvre_that_cannot_be_had_costs_no_answer(
         raise InputError("limits: no manoeuvre of the library keeps to them")
 
     monkeypatch.setattr("avtorch.experiment.next_experiment", refuses)
-    assert main(["diagnose", drive, "--out", str(tmp_path / "out")]) == 0
+    assert main(["diagnose", drive, "--out", str(tmp_path / "out"), "--verbose"]) == 0
     answer = json.loads((tmp_path / "out" / "diagnosis.json").read_text(encoding="utf-8"))
     assert answer["next_experiment"] is None
     told = "No next experiment: limits: no manoeuvre of the library keeps to them."
@@ -303,7 +311,7 @@ def printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     monkeypatch.setenv("COLUMNS", "200")
 
     def lines(found: Diagnosis) -> list[str]:
-        print_diagnosis(Talk(json=False, quiet=False), found)
+        print_diagnosis(Talk(json=False, quiet=False), found, verbose=True)
         return [line.rstrip() for line in capsys.readouterr().out.splitlines()]
 
     return lines
@@ -364,7 +372,7 @@ def test_headline_for_each_kind_of_verdict(logs: list[Log], printed: Callable[[D
 def test_notes(logs: list[Log], printed: Callable[[Diagnosis], list[str]]) -> None:
     def noted(found: Diagnosis) -> list[str]:
         """What stands below the table."""
-        lines = printed(found)
+        lines = printed(found)[:-1]
         return lines[len(lines) - lines[::-1].index("") :]
 
     remaining = (Candidate("none", 0.1, 0.0), Candidate("aerodynamic_drag", 0.897, 40.0), Candidate("gust", 0.003))
@@ -379,8 +387,8 @@ def test_notes(logs: list[Log], printed: Callable[[Diagnosis], list[str]]) -> No
         "hypothesis), speed error 0.9 m/s."
     )
     assert told[4] == "Hypotheses once the simulator has dead_time: aerodynamic_drag 0.897, none 0.100."
-    assert told[5].startswith("The budget ended the search")
-    assert told[6] == "speed [only]"
+    assert told[5] == "speed [only]"
+    assert printed(answer(logs, verdict=both, **more))[1].startswith("The budget ended the search")
 
     sure = verdict_of(CANDIDATES, aliases=lambda ranked: ())
     told = noted(answer(logs, verdict=sure))

@@ -70,6 +70,8 @@ DIAGNOSIS_FILES = (
     "plant.carla.yaml",
     "manoeuvre.csv",
     "report.html",
+    "credibility.html",
+    "credibility.md",
 )
 """Every file that a written diagnosis may contain."""
 
