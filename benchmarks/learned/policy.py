@@ -228,19 +228,22 @@ def supervised(name: str, controller: Controller, *, runs: int = 10) -> tuple[An
         found.append(supervisor.run(80.0, events=[(CHANGE_S, change)]))
     alone, acted = found
     first = [min((a.time_s for a in x if a.time_s > CHANGE_S), default=np.inf) - CHANGE_S for x in alone.alerts]
-    early = sorted({a.detector for x in alone.alerts for a in x if a.time_s <= CHANGE_S})
+    soon = [{a.detector for a in x if a.time_s <= CHANGE_S} for x in alone.alerts]
+    early = f"{sum(bool(x) for x in soon)} of {runs}" + "".join(f", {name}" for name in sorted(set().union(*soon)))
     T, K = (float(x.mean()) for x in alone.windows[-1].report.mean)
+    before, after = (rows_from(r.rows, 30.0) for r in found)
     calm = [
-        float(
-            (of(getattr(rows_from(acted.rows, 30.0), what)) / of(getattr(rows_from(alone.rows, 30.0), what))).median()
-        )
-        for of, what in ((rms, "accel"), (rms_about_mean, "speed"))
+        float((rms(after.accel) / rms(before.accel)).median()),
+        float((rms_about_mean(after.speed) / rms_about_mean(before.speed)).median()),
     ]
     count = sum(bool(x) for x in acted.actions)
-    clipped = [float(rows_from(r.rows, 30.0).clipped.double().mean()) for r in found]
+    spacing = [float(r.rows.spacing.amin(-1).median()) for r in found]
+    hits = [int((r.rows.spacing <= 0).any(-1).sum()) for r in found]
+    clipped = [float(r.clipped.double().mean()) for r in (before, after)]
     print(
-        f"| {name} | {np.median(first):.0f} to {max(first):.0f} | {', '.join(early) or 'none'} | {T:.2f} s, {K:.2f} | "
-        f"{count} of {runs} | {calm[0]:.3f}, {calm[1]:.3f} | {100 * clipped[0]:.0f}, {100 * clipped[1]:.0f} |",
+        f"| {name} | {np.median(first):.0f} to {max(first):.0f} | {early} | {T:.2f} s, {K:.2f} | {count} of {runs} | "
+        f"{calm[0]:.3f}, {calm[1]:.3f} | {spacing[0]:.1f} ({hits[0]}), {spacing[1]:.1f} ({hits[1]}) | "
+        f"{100 * clipped[0]:.0f}, {100 * clipped[1]:.0f} |",
         flush=True,
     )
     last = [x[-1].setting for x in acted.actions if x]
@@ -266,17 +269,26 @@ def platoon(controller: Controller, lower: LowerLevel, *, worn: bool) -> tuple[f
 
 def show(returns: Sequence[float], seconds: float, runs: tuple[Any, Any], path: Path) -> None:
     """The learning curve beside the drive with and without Strategy 1."""
-    figure = Figure(figsize=(9.0, 3.2), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1, 2))
-    left.plot(np.linspace(0, seconds, len(returns)), returns, color="C0")
-    left.set(xlabel="processor time of training [s]", ylabel="mean return of an episode", title="Learning, seed 0")
+    figure = Figure(figsize=(9.0, 4.0), layout="constrained")
+    axes = figure.subplot_mosaic([["learnt", "accel"], ["learnt", "spacing"]], width_ratios=(1, 2))
+    axes["learnt"].plot(np.linspace(0, seconds, len(returns)), returns, color="C0")
+    axes["learnt"].set(xlabel="processor time of training [s]", ylabel="mean return of an episode")
+    axes["learnt"].set_title("Learning, seed 0")
     for run, label, colour in zip(runs, ("no action", "Strategy 1"), ("C3", "C0"), strict=True):
-        right.plot(run.rows.time, run.rows.accel[0], color=colour, lw=1.0, label=label)
-    right.axvline(CHANGE_S, color="0.5", ls=":", lw=1.0)
-    right.annotate("the car changes", (CHANGE_S, right.get_ylim()[0]), xytext=(3, 3), textcoords="offset points")
-    right.set(xlabel="time [s]", ylabel="acceleration [m/s²]", title="The learnt policy behind US06")
-    right.legend(loc="upper right", ncols=2, frameon=False)
-    for ax in (left, right):
+        hit = torch.nonzero(run.rows.spacing[0] <= 0).squeeze(-1)
+        end = int(hit[0]) if len(hit) else len(run.rows.time)  # what follows a collision is not physical
+        for what in ("accel", "spacing"):
+            axes[what].plot(run.rows.time[:end], getattr(run.rows, what)[0, :end], color=colour, lw=1.2, label=label)
+        if len(hit):
+            axes["spacing"].annotate("collides", (float(run.rows.time[end]), 0.0), (0, 4), textcoords="offset points")
+    for what, label in (("accel", "acceleration [m/s²]"), ("spacing", "spacing [m]")):
+        axes[what].axvline(CHANGE_S, color="0.5", ls=":", lw=1.0)
+        axes[what].set_ylabel(label)
+    axes["accel"].set_title("Behind US06; the car changes at the dotted line")
+    axes["accel"].legend(loc="lower right", frameon=False)
+    axes["spacing"].axhline(0.0, color="0.8", lw=1.0)
+    axes["spacing"].set_xlabel("time [s]")
+    for ax in axes.values():
         ax.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=110)
 
@@ -293,9 +305,10 @@ def compare(*, steps: int = 1_500_000, seed: int = 0, out: Path | None = None) -
     controllers: dict[str, Controller] = {"learnt policy": policy, "linear law": LinearController()}
     print(
         "| controller | alert after the change [s] | alarms before it | T_L, K_L believed | Strategy 1 taken | "
-        "RMS with it / without from 30 s: acceleration, speed | clipped without, with it [%] |"
+        "RMS with it / without from 30 s: acceleration, speed | "
+        "least spacing [m] (drives that collide): without, with it | clipped without, with it [%] |"
     )
-    print("|---|---:|---|---|---|---:|---:|")
+    print("|---|---:|---|---|---|---:|---:|---:|")
     drives = {name: supervised(name, controller) for name, controller in controllers.items()}
     print()
     judge(controllers, drives["learnt policy"][2])
