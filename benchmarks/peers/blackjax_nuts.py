@@ -6,6 +6,7 @@ Settings:
     mode: whether chains start from the Laplace approximation at the mode, whose covariance is the first mass matrix;
         else they start at the prior's centre with the identity, as in Stan.
     adapt: ``"chain"``, each chain adapts for itself, as in Stan; ``"shared"``, one chain adapts for all.
+    low_rank: the package's low-rank mass matrix in place of a dense one, also from Stan's start.
     warmup, chains, draws: steps of adaptation, chains side by side, draws a chain.
     burn_in: steps dropped before the draws where chains did not adapt themselves.
 """
@@ -27,7 +28,7 @@ from benchmarks.peers.problem import Windows
 
 class Runner:
     def __init__(self, settings: Settings) -> None:
-        s = {"space": "z", "mode": False, "adapt": "chain", "burn_in": 0, **settings}
+        s = {"space": "z", "mode": False, "adapt": "chain", "burn_in": 0, "low_rank": False, **settings}
         sampler = partial(_whitened if s["space"] == "whitened" else _adapted, s)
         self._one, self._many = jax.jit(sampler), jax.jit(jax.vmap(sampler))
 
@@ -47,13 +48,16 @@ def _adapted(s: Settings, key: jax.Array, sums: jax.Array) -> jax.Array:
     """Draws of ``z``, ``(chain, draw, 3)``, with window adaptation."""
     target = partial(log_density, sums=sums)
     center, scale = mode(sums) if s["mode"] else (prior_center(), 0.1 * jnp.eye(3))
-    adaptation = blackjax.window_adaptation(
-        blackjax.nuts,
-        target,
-        is_mass_matrix_diagonal=False,
-        initial_inverse_mass_matrix=scale @ scale.T if s["mode"] else None,
-        adaptation_info_fn=lambda *_: None,
-    )
+    if s["low_rank"]:
+        adaptation = blackjax.window_adaptation_low_rank(blackjax.nuts, target, max_rank=2)
+    else:
+        adaptation = blackjax.window_adaptation(
+            blackjax.nuts,
+            target,
+            is_mass_matrix_diagonal=False,
+            initial_inverse_mass_matrix=scale @ scale.T if s["mode"] else None,
+            adaptation_info_fn=lambda *_: None,
+        )
     key_start, key_adapt, key_walk = jax.random.split(key, 3)
     starts = center + jax.random.normal(key_start, (s["chains"], 3)) @ scale.T
 

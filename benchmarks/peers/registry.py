@@ -60,6 +60,15 @@ _ALL = (
         gets="one chain, 1000 steps of window adaptation, dense mass; one XLA program over the sums",
     ),
     Method(
+        "blackjax-nuts-low-rank",
+        "BlackJAX NUTS, low-rank warm-up",
+        "blackjax_nuts",
+        needs=_JAX,
+        pip="pip install jax blackjax",
+        candidates=({"low_rank": True, "chains": 1, "warmup": 300, "draws": 3000},),
+        gets="one chain, the package's low-rank mass matrix; one XLA program over the sums",
+    ),
+    Method(
         "blackjax-nuts-mode",
         "BlackJAX NUTS, from our mode",
         "blackjax_nuts",
@@ -154,6 +163,16 @@ _ALL = (
             {"chains": 1, "warmup": 300, "draws": 4000, "low_rank": False},
         ),
         gets="PyMC model over the sums compiled by Numba once; low-rank or diagonal mass, the faster",
+    ),
+    Method(
+        "walnuts",
+        "WALNUTS (walnutpie)",
+        "walnuts",
+        needs=("walnutpie", "numba"),
+        pip="pip install walnutpie numba",
+        candidates=tuple({"chains": 1, "warmup": warmup, "draws": 2500} for warmup in (100, 300)),
+        gets="density and gradient over the sums as a compiled callback; diagonal metric, the shorter warm-up that is "
+        "accurate",
     ),
     Method(
         "pyro-nuts",
