@@ -23,7 +23,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
-from avtorch.arrays import FloatArray
+from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError, listed
 from avtorch.external.simulator import Limits
 from avtorch.gap.engine.compiled_plant import read_late
@@ -65,14 +65,20 @@ class LinearResponse:
         """Mean and standard deviation (size,)."""
         own = [normal_prior(name, 0.0) for name in self.recorder]
         mean, sd = np.array([*[(0.0, 1.0)] * len(self.at), *own]).T
-        return mean, sd
+        return mean, np.where(self._late, np.hypot(sd, 0.5 * self.data.dt), sd)
 
     @cached_property
     def ends(self) -> tuple[FloatArray, FloatArray]:
         """Least and greatest x."""
         plain = Hypothesis(self.data)
         low, high = np.concatenate([self.limits.reshape(-1, 2), [plain.limits(name) for name in self.recorder]]).T
-        return low, high
+        return np.where(self._late, np.minimum(low, -self.data.dt), low), high
+
+    @property
+    def _late(self) -> BoolArray:
+        """Which of x are delays. The car's command moves between rows, where the simulator's is held, so that each
+        channel may lead by a part of a row."""
+        return np.array([False] * len(self.at) + [name.endswith("_delay") for name in self.recorder])
 
     def readings(self, z: FloatArray) -> FloatArray:
         """Of the simulator, (channel, row)."""

@@ -101,6 +101,24 @@ def test_what_a_recorder_makes_late_is_no_wrong_lag() -> None:
     assert sum(accused) < 2
 
 
+def test_a_command_that_moves_between_rows_makes_no_lag_wrong() -> None:
+    """The simulator holds it, and so is late by half a row; a wrong mass is found beside it."""
+    accused, heavy = [], []
+    for seed in range(10):
+        log = recorded(Truck(), seed)
+        car = Truck(mass=1900.0)
+        car.reset(speed=20.0, accel=0.0)
+        fine = np.arange(0.0, log.time[-1] + 0.045, 0.01)
+        run = np.array([car.step(u, 0.01) for u in np.interp(fine, log.time, log.accel_cmd)])
+        noise = NOISE * np.random.default_rng(seed).standard_normal((len(log.time), 2))
+        accel, speed = (np.concatenate([[(0.0, 20.0)], run[4::5][: len(noise) - 1]]) + noise).T
+        found, _ = fitted(replace(log, accel=accel, speed=speed))
+        accused.append(found["lag"][2])
+        heavy.append(found["mass"][2])
+    assert all(heavy)
+    assert sum(accused) < 2
+
+
 def test_few_rollouts_are_enough_and_no_more_are_made() -> None:
     log = recorded(Truck(lag=0.9, mass=1200.0), 1)
     found, count = fitted(log)
