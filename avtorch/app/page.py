@@ -16,6 +16,7 @@ from avtorch.app.controls import STYLES, Chart, CheckBox, Slider
 from avtorch.app.task import Job, Task
 from avtorch.app.workplace import MOST_MB, Workplace, examples
 from avtorch.errors import InputError, printable
+from avtorch.gap.quantity import words_of
 from avtorch.io import Log
 from avtorch.io.atomic import atomic
 from avtorch.io.formats import is_recording, open_recording
@@ -244,7 +245,7 @@ class Switches:
         chance = {"": "", **{e.name: " (by chance; not in the rollout)" if e.random else "" for e in self.car.effects}}
         self.boxes = {x: CheckBox(label=x + chance[x], value=x in on) for x in chance if x}
         self.sliders = {
-            key: Slider(label=key.replace(".", " ").rpartition("_")[0] or key, **_WIDE, **vars(size))
+            key: Slider(label=" ".join([*key.split(".")[:-1], words_of(key.split(".")[-1])]), **_WIDE, **vars(size))
             for key, size in self.trial.sizes(self.car).items()
         }
         rows = [*self.boxes.items(), *self.sliders.items()]
