@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import param
@@ -72,7 +72,7 @@ class Chart:
         self._keep = np.arange(0, len(time), max(1, len(time) // _MOST))
         self._breaks = np.flatnonzero(np.diff(stretch[self._keep])) + 1
         ends = float(time[0]), float(time[-1])
-        x_range = Range1d(*ends, bounds=ends)
+        x_range = Range1d(start=ends[0], end=ends[1], bounds=ends)
         whole = CustomJS(args={"r": x_range}, code="[r.start, r.end] = r.bounds;")
         self.source, self.figures = ColumnDataSource({"time": self._thin(time)}), []
         for quantity, each in lines.items():
@@ -101,6 +101,5 @@ class Chart:
 
     def show(self, lines: Mapping[tuple[str, str], FloatArray]) -> None:
         """Other values (row,) for lines by quantity and name."""
-        self.source.data = dict[str, Any](self.source.data) | {
-            q + name: self._thin(x) for (q, name), x in lines.items()
-        }
+        held = cast(dict[str, Any], self.source.data)
+        self.source.update(data=held | {q + name: self._thin(x) for (q, name), x in lines.items()})
