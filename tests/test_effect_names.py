@@ -13,6 +13,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "avtorch"
 HOME = PACKAGE / "gap" / "effects"
 
 ALLOWED = {
+    "app/workplace.py": "the car of the simulated example has two of them",
     "external/surrogate.py": "a second pole or a limit of the rate begins from a shorter lag",
     "gap/engine": "one compiled loop for all effects: held to their own files row by row in test_compiled_plant.py",
     "gap/result": "what chance decides, and the delay beside T_L, have places of their own in an answer",

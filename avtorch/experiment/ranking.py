@@ -45,6 +45,12 @@ def rank_agreement(
     eight settings, beyond by 20,000 orders drawn at random.
 
     Raises `InputError` for other names on either side, fewer settings, scores that are not finite or all equal.
+
+    Example:
+        >>> from avtorch.experiment import rank_agreement
+        >>> simulated, real = {"soft": 1.2, "firm": 0.8, "hard": 0.9}, {"soft": 1.9, "firm": 1.1, "hard": 1.0}
+        >>> rank_agreement(simulated, real).srcc
+        0.5
     """
     names = list(simulated)
     if set(names) != set(real) or len(names) < 3:
