@@ -42,6 +42,7 @@ def test_what_is_absent_says_what_could_be_there(of_two: Budget) -> None:
     assert time.excited
 
 
+@pytest.mark.slow
 def test_what_was_put_in_is_no_longer_absent() -> None:
     budget = diagnose(log_of([GainChange(0.6, 60.0)], seed=4), effects=FEW).budget
     assert budget is not None
