@@ -295,9 +295,7 @@ class Budget:
                 but = f", but {carried} takes off {percent(self._takes_off)} of it" if carried else ""
                 return f"No known effect explains the gap{but}."
             if carried:
-                return (
-                    f"No known effect is missing; {carried} takes off {percent(self._takes_off)} of what is foretold."
-                )
+                return f"No known effect is missing; {carried} takes off {percent(self._takes_off)} of the gap."
             return (
                 "Nothing material is missing."
                 if rest == "noise"
