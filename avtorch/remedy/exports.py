@@ -145,7 +145,7 @@ class CarlaPedals(Exported):
 
 
 def to_carla(pedals: PedalMap, plant: GapPlant | None = None) -> CarlaPedals:
-    """The map `pedals` for throttle and brake; of the `plant`, if a diagnosis found one behind them, only what is lost."""
+    """The map `pedals` for throttle and brake; of the `plant`, if one was found behind them, only what is lost."""
     given = {"throttle": accel_table(pedals), "brake": brake_table(pedals)}
     tables = {name: table for name, table in given.items() if table is not None}
     lag, late = (pedals.T_L, pedals.dead_time) if plant is None else (float(plant.T_L), delay_of(plant))
