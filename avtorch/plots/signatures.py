@@ -101,7 +101,8 @@ def signature_figure() -> Figure:
     effects = sorted(typical, key=lambda e: (PLACES.index(e.place), e.order, e.name))
     columns = 4
     rows = -(-len(effects) // columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(13, 2.1 * rows + 0.5), sharex=True, sharey=True, layout="constrained")
+    size = (13, 2.1 * rows + 0.5)
+    figure, axes = plt.subplots(rows, columns, figsize=size, sharex=True, sharey=True, layout="constrained")
     for ax, effect in zip(axes.flat, effects, strict=False):
         effect_signature(ax, effect)
         ax.set_title(effect.place, loc="right", fontsize=8, color=GREY, fontweight="normal")
