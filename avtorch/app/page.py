@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 import panel as pn
 
@@ -49,6 +50,8 @@ def page(place: Workplace) -> pn.template.Template:
         fault = str(error)
     template = pn.template.Template(text_of("page.html", "avtorch.app"))
     known = {"folder": str(place.root), "start": f"/{place.token}", "fault": fault, "most": MOST_MB, "view": view}
+    other = urlencode([("log", x) for x in reversed(view.names)]) if view and len(view.names) == 2 else ""
+    known |= {"other": f"/{place.token}?{other}" if other else ""}
     known |= {"heading": _TITLES[len(view.paths) if view else 0], "style": "\n".join(STYLES), "examples": examples()}
     for key, value in (known | {"names": [] if view else place.logs()}).items():
         template.add_variable(key, value)
@@ -105,7 +108,9 @@ class View:
         except InputError as fault:
             self.seen.object, self.chart[:] = _fault(fault), []
             return
-        self.seen.object = "".join(map(_seen, self.names, self.found))
+        when = ["Before: ", "After: "] if len(self.names) == 2 else [""]
+        titles = [f"{x}{name}" for x, name in zip(when, self.names, strict=True)]
+        self.seen.object = "".join(map(_seen, titles, self.found))
         if len(self.found) == 1 and not self.found[0].follows:
             self._confirm(self.found[0])
         self.go.disabled = any(one.fault is not None and not one.follows for one in self.found)
@@ -235,19 +240,21 @@ class Switches:
         self.error, self.controls = _html(), pn.Column(width=300)
         self.add = pn.widgets.Select(name="Add an effect", options=["", *trial.addable()], stylesheets=STYLES)
         self.add.param.watch(self._added, "value")
-        self._build({e.name for e in self.car.effects})
+        self._build({e.name for e in self.car.effects}, {})
         says = "<h2>Switch effects and see</h2><p>The simulator drives anew by the logged commands with each change; "
         says += f"a speed begins anew every 10 s. {self.chart.legend}</p>"
         drawn = pn.Column(*self.chart.figures, min_width=260, styles={"flex": "1 1 26rem"}, **_WIDE)
         self.parts = [_html(says), self.error, pn.FlexBox(pn.Column(self.controls, self.add), drawn, **_WIDE)]
 
-    def _build(self, on: set[str]) -> None:
+    def _build(self, on: set[str], moved: Mapping[str, Any]) -> None:
         chance = {"": "", **{e.name: " (by chance; not in the rollout)" if e.random else "" for e in self.car.effects}}
         self.boxes = {x: CheckBox(label=x + chance[x], value=x in on) for x in chance if x}
         self.sliders = {
             key: Slider(label=" ".join([*key.split(".")[:-1], words_of(key.split(".")[-1])]), **_WIDE, **vars(size))
             for key, size in self.trial.sizes(self.car).items()
         }
+        for key in moved.keys() & self.sliders.keys():
+            self.sliders[key].value = moved[key]
         rows = [*self.boxes.items(), *self.sliders.items()]
         for _, control in rows:
             control.param.watch(self._moved, "value")
@@ -256,10 +263,11 @@ class Switches:
         self._moved()
 
     def _added(self, event: Any) -> None:
-        if event.new:
+        if event.new and event.new not in self.boxes:
             on = {name for name, box in self.boxes.items() if box.value} | {event.new}
-            self.car = self.trial.with_effect(event.new)
-            self._build(on)
+            moved = {key: slider.value for key, slider in self.sliders.items()}
+            self.car = self.trial.with_effect(self.car, event.new)
+            self._build(on, moved)
 
     def _moved(self, _: object = None) -> None:
         on = [name for name, box in self.boxes.items() if box.value]

@@ -36,6 +36,8 @@ def read_simulator(option: str, text: str) -> GapPlant | None:
     if text.strip().lower() == "glvd":
         return None
     given = f"{option} {quoted(text, 80)}"
+    if option != "--simulator":
+        _refuse_code(option, text)
     if text.endswith(".toml") and not os.path.lexists(text):
         raise InputError(f"{given}: no such file; needs a TOML file, or effects such as dead_time=0.2")
     try:
@@ -90,6 +92,8 @@ def simulator_of(
             raise InputError(f"--simulator: {text}") from None
     if len(simulated) == 1 and not Path(simulated[0]).exists() and simulated[0].endswith((".", "_")):
         return ExternalSimulator([_columns(simulated[0], path, drive) for path, drive in drives], name=simulated[0])
+    for text in simulated:
+        _refuse_code("--simulated", text)
     if len(simulated) != len(drives):
         raise InputError(f"--simulated: found {len(simulated)} files for {len(drives)} logs, needs one for each log")
     from avtorch.io import Log
@@ -128,6 +132,12 @@ def simulators_of(
         raise InputError("--step: has a meaning with an object or an FMU as --simulator only")
     found += [simulator_of((text,), None, None, [(path, drive)]) for text in simulated]
     return [x for x in found if x is not None]
+
+
+def _refuse_code(option: str, text: str) -> None:
+    """Raises `InputError` where a simulator itself is given to an option that takes its output or its equations."""
+    if text.lower().endswith(".fmu") or text.partition(":")[0].endswith(".py"):
+        raise InputError(f"{option} {quoted(text, 80)}: is a simulator itself; needs --simulator in place of {option}")
 
 
 def _limits(adjust: Sequence[str]) -> dict[str, tuple[float, float]]:

@@ -90,12 +90,12 @@ class Trial:
             if not (name in own or kind.random or (kind.needs_speed and "speed" not in channels))
             and not (kind.place == "sensor" and "accel" not in channels)
             and all(p.size == 1 for p in kind().coordinates())  # a road's profile is fitted, not set
-            and any(key.startswith(f"{name}.") for key in self.sizes(self.with_effect(name)))
+            and any(key.startswith(f"{name}.") for key in self.sizes(self.with_effect(self.car, name)))
         ]
 
-    def with_effect(self, name: str) -> GapPlant:
-        """The car with one more effect, of typical size."""
-        return plant([EFFECTS[name]], baseline=self.car).prepared(*self.record.drives, fitted=[name])
+    def with_effect(self, car: GapPlant, name: str) -> GapPlant:
+        """`car` with one more effect, of typical size."""
+        return plant([EFFECTS[name]], baseline=car).prepared(*self.record.drives, fitted=[name])
 
     def rollout(
         self, car: GapPlant, on: Collection[str], values: Mapping[str, float]

@@ -116,8 +116,12 @@ def test_an_effect_switched_off_is_an_error(browser: Any, address: str, diagnose
     for _ in range(5):
         page.keyboard.press("ArrowLeft")
     expect(error).not_to_have_text(before)
-    page.get_by_label("Add an effect").select_option("aerodynamic_drag")
+    moved = error.text_content()
+    for name in ("aerodynamic_drag", "dead_band"):  # what was set and added before stays
+        page.get_by_label("Add an effect").select_option(name)
+        page.get_by_role("checkbox", name=name).click()
     page.get_by_role("checkbox", name="aerodynamic_drag").wait_for()
+    expect(error).to_have_text(moved)
     page.close()
 
 
@@ -175,8 +179,11 @@ def test_two_logs_are_compared(browser: Any, address: str, folder: Path) -> None
     for name in ("before.csv", "after.csv"):
         page.get_by_label(name, exact=True).check()
     page.get_by_role("button", name="Open").click()
+    page.get_by_role("heading", name="Before: after.csv").wait_for()  # in the order of the list
+    page.get_by_role("link", name="the other way round").click()
+    page.get_by_role("heading", name="Before: before.csv").wait_for()
     page.get_by_role("button", name="Compare").click()
     page.get_by_role("heading", name="The whole report").wait_for(timeout=LATEST_MS)
-    assert (folder / "out").joinpath("before").joinpath("comparison.html").exists()
+    assert (folder / "out").joinpath("after").joinpath("comparison.html").exists()
     is_sound(page, address, 1280)
     page.close()

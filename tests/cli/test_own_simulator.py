@@ -77,6 +77,8 @@ REFUSED = [
     (["--simulator", "no_such_module:Car"], "--simulator: no_such_module could not be imported"),
     (["--simulator", "my_car"], "--simulator: found 'my_car', needs MODULE:NAME"),
     (["--simulated", "none."], "'none.': no such file, and"),
+    (["--simulated", "my_car.py:Car"], "--simulated 'my_car.py:Car': is a simulator itself; needs --simulator"),
+    (["--baseline", "my_car.fmu"], "--baseline 'my_car.fmu': is a simulator itself; needs --simulator"),
     (["--simulated", "a.csv", "--simulated", "b.csv"], "found 2 files for 1 logs"),
     (["--simulated", "sim.csv", "--simulator", "my_car:Car"], "--simulated, --simulator: found both"),
     (["--simulated", "sim.csv", "--baseline", "dead_time=0.2"], "--baseline: found beside"),

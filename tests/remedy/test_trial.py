@@ -62,7 +62,7 @@ def test_an_effect_can_be_added(trial: Trial) -> None:
     assert "aerodynamic_drag" in names
     assert not {"dead_time", "sensor_bias", "gust", "road_grade"} & set(names)
     for name in names:
-        car = trial.with_effect(name)
+        car = trial.with_effect(trial.car, name)
         assert name in {e.name for e in car.effects}
         assert any(key.startswith(f"{name}.") for key in trial.sizes(car))
 

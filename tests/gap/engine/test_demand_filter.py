@@ -69,9 +69,9 @@ def test_score_and_information_are_those_of_the_simulated_response(
         # moves the residual, which the plant reads between the points of its grid
         slope = float(pulse @ score[first : first + lasts])
         assert abs(slope - _inner(h, change, h.residual)) < 0.15 * np.sqrt(expected[-1])
-    # A frame's lowest coefficients depend on where in it a pulse lies, by some 25 % of a pulse's size where they weigh
-    # most; the information is the mean over places, here of some 40, and its bands have edges: 5 % of standard error.
-    assert sum(sizes) == pytest.approx(sum(expected), rel=0.25)
+    # Pulse by pulse the information is the mean over where in a frame one may lie, by some 25 % of its size, and its
+    # bands have edges, which give it up to 10 % too much: the mean of the logarithms was -0.09 to 0.11 over 120 drives.
+    assert abs(np.log(np.array(sizes) / expected).mean()) < 0.2
 
 
 def test_scores_of_many_columns_are_those_of_each(fresh_seed: int) -> None:
