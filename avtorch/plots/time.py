@@ -14,7 +14,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from avtorch.deprecation import renamed
 from avtorch.io import Log
 from avtorch.io.clock import from_start, time_label
 from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, LABELS, NARROW, ORANGE, SKY, VERMILLION, legend, styled
@@ -94,7 +93,6 @@ def belief_band(
     return _span(ax, _ends(windows))
 
 
-@renamed(until="0.3", target="required")
 def string_probability(
     ax: Axes, windows: Windows, *, required: float = 0.95, actions: Iterable[Mapping[str, Any]] = ()
 ) -> Axes:
@@ -280,7 +278,6 @@ def belief_figure(
     return figure
 
 
-@renamed(until="0.3", target="required")
 @styled
 def probability_figure(
     windows: Windows, *, answer: Mapping[str, Any] | None = None, required: float = 0.95, narrow: bool = False
@@ -312,7 +309,6 @@ def probability_figure(
     return figure
 
 
-@renamed(until="0.3", target="required")
 @styled
 def overview_figure(
     answer: Mapping[str, Any],
