@@ -46,8 +46,8 @@ CERTAIN = 0.4
 SCALES, SHARES = (1.0, 1.5, 3.0, 6.0, 15.0), (0.45, 0.27, 0.14, 0.09, 0.05)
 #: Factor by which a second test increases the points where the first is inconclusive.
 AGAIN = 8
-#: Points times windows at once.
-BLOCK = 2**18
+#: Points times windows at once, here and on a graphics card.
+BLOCK, CARD_BLOCK = 2**18, 2**22
 #: Distances of the starts in SDs of the draws, evenly spaced; these are half of them, the others are mirror images.
 RADII = (4.0, 16.0)
 STARTS, STEPS = 16, 3
@@ -151,10 +151,9 @@ class Exactness:
             if len(index) == len(self.missed):
                 return other
             where = torch.ones_like(index, dtype=torch.bool)
-        parts = {}
+        parts, here, there = {}, index[where], where.nonzero().squeeze(-1)
         for name in self.__dataclass_fields__:
-            parts[name] = getattr(self, name).clone()
-            parts[name][index[where]] = getattr(other, name)[where]
+            parts[name] = getattr(self, name).index_copy(0, here, getattr(other, name)[there])
         return replace(self, **parts)
 
     @classmethod
@@ -257,7 +256,7 @@ def weighed(density: Density, moments: Moments, points: int, *, eager: bool = Fa
     mean, lower, share, mean_error, sd_error = moments
     base, log_proposal = (x.to(mean.device) for x in proposal(points, mean.shape[-1]))
     found = []
-    size = max(1, BLOCK // points) if has_selection(density) else len(mean)
+    size = max(1, (CARD_BLOCK if mean.is_cuda else BLOCK) // points) if has_selection(density) else len(mean)
     for part in torch.arange(len(mean), device=mean.device).split(size):
         chosen = _picked(density, part)
         loops = Unavailable("not asked for") if eager else compiled(chosen)
