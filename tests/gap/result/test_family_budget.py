@@ -15,9 +15,7 @@ FEW = ["dead_time", "brake_throttle_asymmetry", "sensor_bias", "gain_change", "g
 @pytest.fixture(scope="module")
 def of_two() -> Budget:
     """Of a car whose brakes are weak and whose accelerometer is biased: two families."""
-    log = log_of(
-        [BrakeThrottleAsymmetry(brake_gain_ratio=0.6, brake_lag_ratio=1.0), SensorBias(BIAS)], seed=3, seconds=100.0
-    )
+    log = log_of([BrakeThrottleAsymmetry(brake_gain_ratio=0.6, brake_lag_ratio=1.0), SensorBias(BIAS)], seed=3)
     budget = diagnose(log, effects=FEW).budget
     assert budget is not None
     return budget
