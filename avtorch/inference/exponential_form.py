@@ -50,7 +50,9 @@ class PotentialTerms:
         device = next((term.device for term in given if isinstance(term, Tensor)), None)
 
         def full(value: Tensor | float, *shape: int) -> Tensor:
-            return torch.as_tensor(value, dtype=torch.float64, device=device).expand(windows, *shape)
+            # not `as_tensor`, which would wait for a graphics card
+            value = value if isinstance(value, Tensor) else torch.full((), value, dtype=torch.float64, device=device)
+            return value.to(torch.float64).expand(windows, *shape)
 
         vectors = full(own_linear, d), full(own_square, d)
         return cls(full(constant), full(linear, d), full(quadratic, d, d), *vectors)

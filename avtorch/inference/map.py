@@ -26,6 +26,9 @@ from avtorch.inference.exponential_form import ExponentialForm, has_form, outdat
 FLAT = 1e-6
 """Least curvature that a step assumes, so that a flat direction does not become an endless step."""
 
+EIGEN_BATCH = 10_000
+"""Matrices decomposed at once: so many pass on a graphics card, 100,000 ended in an internal error of cuSOLVER's."""
+
 
 @dataclass(frozen=True)
 class Mode:
@@ -113,12 +116,12 @@ def find_mode(
         z, potential, gradient, hessian = (torch.from_numpy(x) for x in _ascend(form, z, iterations, tolerance))
     else:
         z, potential, gradient, hessian = _search(density, z, iterations, tolerance, from_values)
-    eigenvalues, basis = torch.linalg.eigh(hessian)
+    eigenvalues, basis = _eigh(hessian)
     decrement = 0.5 * (torch.einsum("wij,wi->wj", basis, gradient).square() / eigenvalues.abs().clamp_min(FLAT)).sum(-1)
     converged = (eigenvalues > 0).all(-1) & (decrement < 1e-4) & potential.isfinite()
     root = basis * eigenvalues.abs().clamp_min(FLAT).rsqrt().unsqueeze(-2)
     # its triangular form without squaring it, which would lose half the digits of a narrow posterior
-    scale = torch.linalg.qr(root.mT).R.mT
+    scale = torch.linalg.qr(root.mT, mode="r").R.mT
     return Mode(z, scale, -potential, converged)
 
 
@@ -205,7 +208,7 @@ def _search(
     damping = torch.ones_like(z[:, 0])
     potential, gradient, hessian = _expand(density, z, from_values)
     for _ in range(iterations):
-        eigenvalues, basis = torch.linalg.eigh(hessian)
+        eigenvalues, basis = _eigh(hessian)
         # the floor keeps a flat direction from becoming an endless step
         curvature = eigenvalues.abs().clamp_min(FLAT)
         projected = torch.einsum("wij,wi->wj", basis, gradient)
@@ -223,6 +226,13 @@ def _search(
         hessian = torch.where(better[:, None, None], new_hessian, hessian)
         damping = torch.where(better, (2 * damping).clamp_max(1.0), 0.25 * damping)
     return z, potential, gradient, hessian
+
+
+def _eigh(hessian: Float[Tensor, "window d d"]) -> tuple[Float[Tensor, "window d"], Float[Tensor, "window d d"]]:
+    if len(hessian) <= EIGEN_BATCH:
+        return torch.linalg.eigh(hessian)
+    values, basis = zip(*(torch.linalg.eigh(part) for part in hessian.split(EIGEN_BATCH)), strict=True)
+    return torch.cat(values), torch.cat(basis)
 
 
 def _expand(
