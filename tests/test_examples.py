@@ -49,7 +49,6 @@ SLOW = frozenset(
         "avtorch.paper.reproduce.reproduce",
         "avtorch.paper.strategies.Strategies",
         "avtorch.paper.strategies.strategies",
-        "avtorch.pedals.held_out.held_out",
         "avtorch.plots.paper.paper_pictures",
         "avtorch.plots.posterior_figures.validation_figures",
         "avtorch.plots.signatures.signature_figure",

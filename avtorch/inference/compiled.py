@@ -19,6 +19,7 @@ from avtorch.errors import InputError
 from avtorch.inference.coordinates import Coordinates
 from avtorch.inference.density import Density
 from avtorch.inference.exponential_form import ExponentialForm, has_form, outdated
+from avtorch.inference.pareto import tail_of
 from avtorch.inference.planes import empty_planes, to_planes
 from avtorch.inference.sampler_settings import SamplerSettings
 
@@ -88,6 +89,28 @@ class Compiled:
         share(go, pieces, threads=1 if work < ALONE else torch.get_num_threads())
         return kept
 
+    def summarised(
+        self, coordinates: Coordinates, w: Float[Tensor, "chain draw window 3"], groups: int, pieces: int, tail: float
+    ) -> tuple[Tensor, ...]:
+        """Of draws ``w``: nested R-hat ``(window, 3)`` by so many ``groups``, the furthest ``(window, 3)``, and what
+        :class:`~avtorch.inference.exactness.Moments` holds of ``z``."""
+        chains, _, windows, d = w.shape
+        kept = to_planes(w.transpose(0, 1)).numpy()
+        lower = np.ascontiguousarray(coordinates.lower.numpy())
+        rhat, mean, furthest = np.empty((windows, d)), np.empty((windows, d)), np.empty(windows, np.int64)
+        covariance, errors = np.empty((windows, d, d)), np.empty((windows, d, d))
+
+        def go(first: int, last: int) -> None:
+            given = (kept, lower, min(groups, chains), pieces, tail, rhat, furthest, mean, covariance, errors)
+            self.kernels.summarise(first, last, *given)
+
+        share(go, windows, threads=1 if w.numel() < ALONE else torch.get_num_threads())
+        draw, chain = np.divmod(furthest, chains)
+        far = kept[:, np.arange(windows), draw, chain].T
+        middle = coordinates.z(torch.from_numpy(mean))
+        of_draws = torch.from_numpy(errors).unbind(-1)
+        return torch.from_numpy(rhat), torch.from_numpy(far), middle, torch.from_numpy(covariance), *of_draws
+
     def weighed(
         self,
         mean: Float[Tensor, "window 3"],
@@ -95,22 +118,35 @@ class Compiled:
         base: Float[Tensor, "point 3"],
         log_proposal: Float[Tensor, " point"],
         tail: float,
-    ) -> tuple[Float[Tensor, "point window"], Float[Tensor, "6 window 3"]]:
-        """Log importance ratios at ``mean + lower base``; weighted mean, variance and share beyond ``tail``, in SDs of
-        ``lower`` about ``mean``, and the errors of these three."""
+    ) -> tuple[Tensor, ...]:
+        """Pareto-k of the importance ratios at ``mean + lower base``, ``(window,)``; weighted mean, variance and share
+        beyond ``tail``, in SDs of ``lower`` about ``mean``, and the errors of these three, each ``(window, 3)``."""
         windows, points = len(mean), np.ascontiguousarray(to_planes(base).numpy())
-        ratio, found = np.empty((windows, points.shape[1])), np.empty((windows, 3, 6))
+        log_ratio, found = np.empty((windows, points.shape[1])), np.empty((windows, 3, 6))
         axes = (lower / lower.square().sum(-1, keepdim=True).sqrt()).contiguous().numpy()
         potential = whitened(self.form, Coordinates(mean, lower))
-        t, z = self.form.terms, mean[:, :, None]
-        constant = t.constant + (t.linear[:, None] @ z + 0.5 * (z.mT @ t.quadratic @ z))[:, 0, 0]
 
         def go(first: int, last: int) -> None:
             given = (points, log_proposal.numpy(), axes, tail)
-            self.kernels.weigh(first, last, found, ratio, *given, *potential, constant.numpy())
+            self.kernels.weigh(first, last, found, log_ratio, *given, *potential)
 
-        share(go, windows, threads=1 if ratio.size < ALONE else torch.get_num_threads())
-        return torch.from_numpy(ratio).T, torch.from_numpy(found).movedim(-1, 0)
+        share(go, windows, threads=1 if log_ratio.size < ALONE else torch.get_num_threads())
+        largest, shape = torch.from_numpy(log_ratio).topk(tail_of(points.shape[1]) + 1).values, np.empty(windows)
+        self.kernels.pareto_shapes(largest.numpy(), shape)
+        return torch.from_numpy(shape), *torch.from_numpy(found).unbind(-1)
+
+    def climbed(
+        self, coordinates: Coordinates, starts: Float[Tensor, "start 3"], steps: int, stride: float
+    ) -> tuple[Float[Tensor, "start window 3"], Float[Tensor, "start window"]]:
+        """Where ascents from ``starts`` end, in ``w``, and the log density there less that at ``w = 0``."""
+        windows, lanes = len(coordinates.mode), self.kernels.LANES
+        ends, heights, begin = np.empty((windows, 3, lanes)), np.empty((windows, lanes)), np.zeros((3, lanes))
+        begin[:, : len(starts)] = starts.numpy().T
+        self.kernels.climb(
+            0, windows, ends, heights, begin.ravel(), steps, stride, *whitened(self.form, coordinates)
+        )  # fmt: skip
+        count = len(starts)
+        return torch.from_numpy(ends[:, :, :count]).permute(2, 0, 1), torch.from_numpy(heights[:, :count]).T
 
 
 def words(generator: torch.Generator | None) -> tuple[np.uint64, np.uint64]:

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
 from avtorch.inference.compiled import Compiled, Unavailable, compiled
-from avtorch.inference.coordinates import score_of
+from avtorch.inference.coordinates import Coordinates, score_of
 from avtorch.inference.density import Density, has_selection
 from avtorch.inference.map import find_mode
 from avtorch.inference.pareto import RELIABLE, pareto_k
@@ -165,9 +165,14 @@ class Exactness:
 
 
 def compare_with_exact(
-    density: Density, z: Float[Tensor, "chain draw window parameter"], *, eager: bool = False
+    density: Density,
+    z: Float[Tensor, "chain draw window parameter"],
+    *,
+    eager: bool = False,
+    moments: Moments | None = None,
 ) -> Exactness:
-    """Compare draws ``z`` ``(chain, draw, window, parameter)`` with their density; ``eager`` without compiled loops.
+    """Compare draws ``z`` ``(chain, draw, window, parameter)``, of these ``moments`` where they are known, with their
+    density; ``eager`` without compiled loops.
 
     The first test takes few points compared with the draws; windows where it is inconclusive get about AGAIN times as
     many, which is where a compiled density begins, and those still undecided get AGAIN times more. Windows that pass
@@ -185,7 +190,7 @@ def compare_with_exact(
             return everyone[where]
         return everyone if bool(where.any()) else everyone[:0]
 
-    moments = Moments.of(z)
+    moments = Moments.of(z) if moments is None else moments
     if not eager and isinstance(compiled(density), Compiled):  # compiled points cost less than another call
         points, *counts = counts
     found = weighed(density, moments, points, eager=eager)
@@ -197,7 +202,7 @@ def compare_with_exact(
     index = chosen(found.holds())
     if len(index):
         part = moments.select(index)
-        found.missed[index] = missed_mass(_picked(density, index), part.mean, part.lower)
+        found.missed[index] = missed_mass(_picked(density, index), part.mean, part.lower, eager=eager)
     return found
 
 
@@ -228,14 +233,12 @@ class Moments(NamedTuple):
     def of(cls, z: Float[Tensor, "chain draw window parameter"]) -> Moments:
         """Compute them from draws ``(chain, draw, window, parameter)``."""
         chains, draws = z.shape[:2]
-        pieces = max(1, min(draws // 2, -(-16 // chains)))
+        pieces = pieces_of(chains, draws)
         planes = to_planes(z.transpose(0, 1))  # (parameter, window, draw, chain), contiguous as the walk leaves it
         mean = planes.mean((-2, -1))
         centred = planes - mean[..., None, None]
         flat = centred.flatten(2).movedim(0, 1)  # (window, parameter, draw x chain)
         covariance = flat @ flat.mT / (flat.shape[-1] - 1)
-        lower, failed = torch.linalg.cholesky_ex(covariance.nan_to_num())
-        lower = torch.where((failed == 0)[:, None, None], lower, torch.nan)
         variance = covariance.diagonal(dim1=-2, dim2=-1).mT  # (parameter, window)
         square = centred.square()
         share = (square > TAIL**2 * variance[..., None, None]).mean((-2, -1), dtype=z.dtype)
@@ -244,11 +247,22 @@ class Moments(NamedTuple):
         root = (pieces * chains) ** 0.5
         of_mean = each.flatten(2).std(-1) / variance.sqrt() / root
         of_sd = 0.5 * squares.flatten(2).std(-1) / variance / root
-        return cls(mean.mT, lower, share.mT, of_mean.mT, of_sd.mT)
+        return cls(mean.mT, root_of(covariance), share.mT, of_mean.mT, of_sd.mT)
 
     def select(self, index: Int[Tensor, " chosen"]) -> Moments:
         """The windows named by ``index``."""
         return self if len(index) == len(self.mean) else Moments(*(x[index] for x in self))
+
+
+def pieces_of(chains: int, draws: int) -> int:
+    """Into how many pieces each chain is cut, so that there are sixteen."""
+    return max(1, min(draws // 2, -(-16 // chains)))
+
+
+def root_of(covariance: Float[Tensor, "window d d"]) -> Float[Tensor, "window d d"]:
+    """Its triangular root, NaN where it has none."""
+    lower, failed = torch.linalg.cholesky_ex(covariance.nan_to_num())
+    return torch.where((failed == 0)[:, None, None], lower, torch.nan)
 
 
 def weighed(density: Density, moments: Moments, points: int, *, eager: bool = False) -> Exactness:
@@ -263,8 +277,7 @@ def weighed(density: Density, moments: Moments, points: int, *, eager: bool = Fa
         if isinstance(loops, Unavailable):
             found.append(_weighed(chosen, mean[part], lower[part], base, log_proposal))
         else:
-            log_ratio, moments_of = loops.weighed(mean[part], lower[part], base, log_proposal, TAIL)
-            found.append((pareto_k(log_ratio), *moments_of))
+            found.append(loops.weighed(mean[part], lower[part], base, log_proposal, TAIL))
     k, m, variance, tail, m_error, v_error, tail_error = (torch.cat(x) for x in zip(*found, strict=True))
     spread = variance.sqrt()
     # binomial error of the tail's share, for the mean's effective number of independent draws
@@ -331,40 +344,54 @@ def proposal(points: int, d: int) -> tuple[Float[Tensor, "point d"], Float[Tenso
 
 
 def missed_mass(
-    density: Density, mean: Float[Tensor, "window parameter"], lower: Float[Tensor, "window parameter parameter"]
+    density: Density,
+    mean: Float[Tensor, "window parameter"],
+    lower: Float[Tensor, "window parameter parameter"],
+    *,
+    eager: bool = False,
 ) -> Float[Tensor, " window"]:
     """Mass of the heaviest mode found far from the draws, over that at the draws, ``(window,)``; 0 where none was.
 
     Args:
         mean, lower: the draws' mean ``(window, parameter)`` and triangular root of their covariance.
+        eager: without compiled loops.
     """
-    w = starts(mean.shape[-1]).to(mean.device)[:, None].expand(-1, len(mean), -1)
+    missed, loops = mean.new_zeros(len(mean)), Unavailable("not asked for") if eager else compiled(density)
     try:
-        for _ in range(STEPS):
-            slope = lower_transposed_times(lower, score_of(density, lower_times(lower, w) + mean))
-            w = w + slope * (STRIDE / slope.square().sum(-1, keepdim=True).sqrt_()).clamp_max_(1.0)
-        w = w.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
-        with torch.no_grad():
-            end = lower_times(lower, w) + mean
-            height = density.log_prob(torch.cat([mean[None], end]))
+        if isinstance(loops, Unavailable):
+            w, height = _climbed(density, mean, lower)
+        else:
+            w, height = loops.climbed(Coordinates(mean, lower), starts(mean.shape[-1]), STEPS, STRIDE)
     except ValueError:  # a user's function that raises this far out: no search ends there
-        return mean.new_zeros(len(mean))
-    high = (w.square().sum(-1) > FAR**2) & (height[1:] > height[:1] - DEPTH)
-    missed = mean.new_zeros(len(mean))
+        return missed
+    high = (w.square().sum(-1) > FAR**2) & (height > -DEPTH)
     index = high.any(0).nonzero().squeeze(-1)
     if not len(index) or not (has_selection(density) or len(mean) == 1):
         return missed
-    best = height[1:].masked_fill(~high, -torch.inf).argmax(0)[index]
-    chosen = density.select(index) if has_selection(density) and len(index) < len(mean) else density
-    other = find_mode(chosen, start=end[best, index])
+    best = height.masked_fill(~high, -torch.inf).argmax(0)[index]
+    chosen = _picked(density, index)
+    other = find_mode(chosen, start=lower_times(lower[index], w[best, index]) + mean[index])
+    with torch.no_grad():
+        centre = chosen.log_prob(mean[index])
     away = torch.linalg.solve_triangular(lower[index], (other.z - mean[index])[..., None], upper=False)[..., 0]
-    volume = (other.scale.diagonal(dim1=-2, dim2=-1).abs().log() - lower[index].diagonal(dim1=-2, dim2=-1).log()).sum(
-        -1
-    )
+    roots = (root.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1) for root in (other.scale, lower[index]))
     # a skewed posterior's own mode lies near its draws; the density at their centre replaces it
-    ratio = (other.log_prob - height[0, index] + volume).exp()
+    ratio = (other.log_prob - centre + next(roots) - next(roots)).exp()
     there = other.converged & (away.norm(dim=-1) > FAR) & (ratio > MASS)
     return missed.index_put((index,), torch.where(there, ratio, 0.0))
+
+
+def _climbed(density: Density, mean: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
+    """Where ascents from all starts end, in the draws' SDs about their mean, and the log density there less that at the
+    mean."""
+    w = starts(mean.shape[-1]).to(mean.device)[:, None].expand(-1, len(mean), -1)
+    for _ in range(STEPS):
+        slope = lower_transposed_times(lower, score_of(density, lower_times(lower, w) + mean))
+        w = w + slope * (STRIDE / slope.square().sum(-1, keepdim=True).sqrt_()).clamp_max_(1.0)
+    w = w.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+    with torch.no_grad():
+        height = density.log_prob(torch.cat([mean[None], lower_times(lower, w) + mean]))
+    return w, height[1:] - height[:1]
 
 
 @lru_cache(maxsize=32)

@@ -19,6 +19,11 @@ def reliable(draws: int) -> float:
     return min(1 - 1 / math.log10(draws), RELIABLE) if draws > 10 else -math.inf
 
 
+def tail_of(n: int) -> int:
+    """How many of ``n`` ratios are their tail."""
+    return max(5, math.ceil(min(n / 5, 3 * n**0.5)))
+
+
 def pareto_k(log_ratio: Float[Tensor, "draw window"]) -> Float[Tensor, " window"]:
     """Shape ``k`` of the tail of ratios given by their logarithm ``(draw, window)``; returns ``(window,)``.
 
@@ -26,8 +31,7 @@ def pareto_k(log_ratio: Float[Tensor, "draw window"]) -> Float[Tensor, " window"
     in Pareto-smoothed importance sampling (Vehtari et al., JMLR 25(72), 2024). Infinite where a ratio is NaN or all
     are zero; minus infinity where the largest are all alike.
     """
-    n = len(log_ratio)
-    tail = max(5, math.ceil(min(n / 5, 3 * n**0.5)))
+    tail = tail_of(len(log_ratio))
     largest = log_ratio.masked_fill(log_ratio.isnan(), -torch.inf).topk(tail + 1, 0).values
     broken = log_ratio.isnan().any(0) | ~largest[0].isfinite()
     ratio = (largest - largest[0]).exp().nan_to_num(nan=0.0)

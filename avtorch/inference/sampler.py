@@ -14,7 +14,7 @@ from avtorch.inference.compiled import chosen
 from avtorch.inference.coordinates import Coordinates, stiffness
 from avtorch.inference.density import Density, SubsampledDensity, constrained, has_score, has_selection
 from avtorch.inference.device import check_generator
-from avtorch.inference.exactness import Exactness, compare_with_exact
+from avtorch.inference.exactness import TAIL, Exactness, Moments, compare_with_exact, pieces_of, root_of
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.planes import empty_planes
 from avtorch.inference.posterior import Posterior, nested_rhat
@@ -87,14 +87,17 @@ def sample(
             coordinates, w = _walk(part, where, settings.slower(times), slowdown[index], generator)
             fresh = torch.isin(index, open_)
             new = index[fresh]
-            diverged[new] = _diverged(part, where, coordinates, w)[fresh]
-            unmixed[new] = ~(nested_rhat(w).amax(-1) <= limit)[fresh]  # NaN counts as not converged
+            rhat, far, moments = _summary(part, settings, coordinates, w)
+            diverged[new] = _diverged(part, where, coordinates.z(far))[fresh]
+            unmixed[new] = ~(rhat.amax(-1) <= limit)[fresh]  # NaN counts as not converged
             stuck[new] = (slowdown[new] > STUCK) | _too_wide(where, settings, slowdown[index], times)[fresh]
             z = coordinates.z(w)
             values = constrained(density, z)
             draws[:, :, new] = values if len(new) == len(index) else values[:, :, fresh]
             if settings.compare:
-                found = found.put(index, compare_with_exact(part, z, eager=settings.walk == "eager"), fresh)
+                found = found.put(
+                    index, compare_with_exact(part, z, eager=settings.walk == "eager", moments=moments), fresh
+                )
         slowdown = 2 * slowdown
         again = diverged | unmixed
         if settings.compare:
@@ -188,19 +191,31 @@ def _select(density: Density, index: Tensor) -> Density:
     return density.select(index)
 
 
+def _summary(
+    density: Density, settings: SamplerSettings, coordinates: Coordinates, w: Float[Tensor, "chain draw window d"]
+) -> tuple[Float[Tensor, "window d"], Float[Tensor, "window d"], Moments | None]:
+    """Nested R-hat of draws, the furthest of each window, ``(window, d)`` both, and their moments if compiled."""
+    chains, draws, windows, _ = w.shape
+    loops = chosen(density, settings)
+    if loops is not None:
+        rhat, far, mean, covariance, *rest = loops.summarised(coordinates, w, 8, pieces_of(chains, draws), TAIL)
+        return rhat, far, Moments(mean, root_of(covariance), *rest)
+    distance = w.square().sum(-1).nan_to_num_(nan=torch.inf)
+    furthest = distance.transpose(0, 1).flatten(0, 1).argmax(0)  # in the order of memory
+    far = w.transpose(0, 1).flatten(0, 1)[furthest, torch.arange(windows, device=w.device)]
+    return nested_rhat(w), far, None
+
+
 def _diverged(
-    density: Density, mode: Mode, coordinates: Coordinates, w: Float[Tensor, "chain draw window d"], depth: float = 50.0
+    density: Density, mode: Mode, far: Float[Tensor, "window d"], depth: float = 50.0
 ) -> Bool[Tensor, " window"]:
-    """Where some chain's furthest draw lies ``depth`` nats and one a parameter off the mode, ``(window,)`` bool.
+    """Where the furthest draw ``far`` lies ``depth`` nats and one a parameter off the mode, ``(window,)`` bool.
 
     R-hat alone does not detect a few diverging chains: they increase the variance within as much as that between. A
     draw of a normal lies ``chi^2/2`` nats deep: among ten thousand in three dimensions none beyond 20.
     """
-    distance = w.square().sum(-1).nan_to_num_(nan=torch.inf)
-    furthest = distance.transpose(0, 1).flatten(0, 1).argmax(0)  # in the order of memory
     with torch.no_grad():
-        far = coordinates.z(w.transpose(0, 1).flatten(0, 1)[furthest, torch.arange(w.shape[2], device=w.device)])
-        return ~((mode.log_prob - density.log_prob(far)).abs() <= depth + w.shape[-1])
+        return ~((mode.log_prob - density.log_prob(far)).abs() <= depth + far.shape[-1])
 
 
 def walk(
