@@ -13,6 +13,8 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constr
 # One thread per process: the tests run in parallel, and small tensors gain nothing from more.
 export OMP_NUM_THREADS ?= 1
 export MKL_NUM_THREADS ?= 1
+# The tests start hundreds of interpreters, each of which would compile the package anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 # Inputs of the fuzzer's nightly mode.
 FUZZ ?= 100000
@@ -31,10 +33,10 @@ demo: $(VENV)/.installed
 	@echo "All on one page, with what they say: $(CURDIR)/out/demo/run.html"
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n $(JOBS) -m "not slow" $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "not slow" $(PYTEST_ARGS)
 
 test-all: $(VENV)/.installed-sumo
-	$(BIN)/python -m pytest -n $(JOBS) $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
 
 fuzz: $(VENV)/.installed-dev
 	AVTORCH_FUZZ=$(FUZZ) $(BIN)/python -m pytest tests/fuzz $(PYTEST_ARGS)

@@ -2,8 +2,9 @@
 
 ``AVTORCH_DATA=DIR python -m benchmarks.budgets [--only TEXT] [--in-front SIZE ...] [--picture FILE]``
 
-Prints a row a recording: the causes with their shares and parameters, and what each half says alone; and then what is
-known of these cars by other means (`known_facts`), a row a fact, beside the budget's figure.
+Prints a row a recording: the causes with their shares and parameters; what each half says alone, how many families are
+there in both halves of those in either, and of those with a size in both how many have overlapping 90 % intervals; then
+what is known of these cars by other means (`known_facts`), a row a fact, beside the budget's figure.
 
 With ``--in-front`` a row a known effect of that size, put in front of the recording as one car's, several logs as
 segments of one: what is named; the size found on top of the untouched recording's over the size put in, and whether its
@@ -27,7 +28,7 @@ import numpy as np
 
 from avtorch import diagnose, plots
 from avtorch.errors import InputError
-from avtorch.gap import gap_budget
+from avtorch.gap import Budget, gap_budget
 from avtorch.io import Log
 from benchmarks.budget_cells import causes
 from benchmarks.effects_in_front import in_front
@@ -53,8 +54,8 @@ SETS: dict[str, tuple[str, ...]] = {
 }
 """Recordings with commands, by name: the logs of one car."""
 HEADER = (
-    "| recording | s | error before, left | causes | unexplained | first half / second half | processor s |\n"
-    "|---|---|---|---|---|---|---|"
+    "| recording | s | error before, left | causes | unexplained | first half / second half | families | seconds |\n"
+    "|---|---|---|---|---|---|---|---|"
 )
 _BETWEEN_S = 5.0
 
@@ -64,12 +65,26 @@ def half(logs: Sequence[Log], which: int) -> list[Log]:
     return [log[slice(0, log.rows // 2) if which == 0 else slice(log.rows // 2, log.rows)] for log in logs]
 
 
-def tried(logs: Sequence[Log]) -> str:
+def tried(logs: Sequence[Log]) -> Budget | str:
+    """The budget, or why there is none."""
     try:
-        budget = gap_budget(logs)
+        return gap_budget(logs)
     except InputError as refusal:
         return f"({refusal})"
-    return ", ".join(budget.names) or budget.verdict[0]
+
+
+def said(budget: Budget | str) -> str:
+    return budget if isinstance(budget, str) else ", ".join(budget.names) or budget.verdict[0]
+
+
+def families_alike(one: Budget | str, other: Budget | str) -> tuple[int, int, int, int]:
+    """Families that are there in both halves, in either; with sizes that agree, with sizes in both."""
+    if isinstance(one, str) or isinstance(other, str):
+        return 0, 0, 0, 0
+    mine, others = ({f.family: f.size_mps2 for f in budget.families if f.present} for budget in (one, other))
+    both = [(mine[name], others[name]) for name in mine.keys() & others.keys()]
+    agree = [max(a.q05, b.q05) <= min(a.q95, b.q95) for a, b in both if a is not None and b is not None]
+    return len(both), len(mine.keys() | others.keys()), sum(agree), len(agree)
 
 
 def joined(logs: Sequence[Log]) -> Log:
@@ -99,6 +114,7 @@ def main() -> None:
     if not (arguments.picture or arguments.in_front):
         print(HEADER, flush=True)
     facts: list[Told] = []
+    totals = np.zeros(4, int)
     for name, files in SETS.items():
         if arguments.only not in name:
             continue
@@ -118,15 +134,22 @@ def main() -> None:
             print(f"| {name} | | | ({fault}) | | | |", flush=True)
             continue
         spent = time.process_time() - begun
-        halves = " / ".join(tried(half(logs, which)) for which in (0, 1))
+        halves = [tried(half(logs, which)) for which in (0, 1)]
+        alike = families_alike(*halves)
+        totals += alike
         share = f"{budget.before:.2f} to {budget.left:.2f}"
         unexplained = f"{budget.unexplained.share.mean:.0%}"
         seconds = np.sum([log.seconds for log in logs])
         print(
-            f"| {name} | {seconds:.0f} | {share} | {causes(budget)} | {unexplained} | {halves} | {spent:.0f} |",
+            f"| {name} | {seconds:.0f} | {share} | {causes(budget)} | {unexplained} | "
+            f"{' / '.join(map(said, halves))} | {alike[0]} of {alike[1]}, {alike[2]} of {alike[3]} | {spent:.0f} |",
             flush=True,
         )
         facts += told(name, budget)
+    print(
+        f"\nFamilies in both halves: {totals[0]} of {totals[1]}; sizes that agree: {totals[2]} of {totals[3]}",
+        flush=True,
+    )
     if facts:
         print("\n".join(["", FACTS_HEADER, *map(str, facts), "", closing(facts)]), flush=True)
 

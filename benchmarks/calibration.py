@@ -23,7 +23,8 @@ from avtorch.inference.priors import Prior
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.inference.sequential import Mode, SequentialInference
-from avtorch.validation.calibration import (
+from avtorch.validation.simulation import Amplitude, statistics
+from benchmarks.rank_calibration import (
     LEVELS,
     RankCalibration,
     batches,
@@ -32,7 +33,6 @@ from avtorch.validation.calibration import (
     joined,
     sbc_quadrature,
 )
-from avtorch.validation.simulation import Amplitude, statistics
 
 LEVEL, SEED = 0.01, 20240601
 STRONG, WEAK, VARIED = 1.0, 0.1, (0.1, 2.0)

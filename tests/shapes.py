@@ -92,11 +92,13 @@ def checked(function: Callable[..., Any], names: dict[str, Any] | None = None) -
         return function
     answer = hints.pop("return", None)
     signature = inspect.signature(function)
+    named = [(i, name) for i, name in enumerate(signature.parameters) if name in hints]
     passed: set[object] = set()
 
     @functools.wraps(function)
     def held(*args: Any, **kwargs: Any) -> Any:
-        kinds = (*map(_kind, args), *((k, _kind(v)) for k, v in kwargs.items()))
+        # of the arguments that name a shape alone: this is done ten thousand times in a loop
+        kinds = tuple([_kind(args[i]) if i < len(args) else _kind(kwargs.get(name)) for i, name in named])
         if kinds in passed:
             return function(*args, **kwargs)
         out = function(*args, **kwargs)

@@ -34,9 +34,9 @@ def check_windows(windows: list[dict]) -> None:
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """20 s of a healthy vehicle behind the default leader, as a CSV."""
+    """12 s of a healthy vehicle behind the default leader, as a CSV."""
     path = tmp_path_factory.mktemp("log") / "drive.csv"
-    run = simulate(Leader.default(duration=21.0), plant=GLVDPlant(0.3, 1.0, sigma=0.1), duration=20.0, seeds=[1])
+    run = simulate(Leader.default(duration=13.0), plant=GLVDPlant(0.3, 1.0, sigma=0.1), duration=12.0, seeds=[1])
     run.log().write(path)
     return path
 

@@ -1,4 +1,4 @@
-"""Every public name is documented with an example, and the examples run and print the output shown."""
+"""What a page names has an example in its docstring, and all examples run and print the output shown."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.public_names import Public, every, path_of
+from tests.public_names import ROOT, Public, every, offered, path_of
 
 PUBLIC = every()
-# Public names that have no example yet. A name that has one leaves the list.
-WITHOUT: frozenset[str] = frozenset()
+PAGES = [p for place in ("README.md", "docs/**/*.md", "notebooks/*.py") for p in sorted(ROOT.glob(place))]
 # What needs recordings or a display, and so cannot run everywhere, with the reason.
 SKIPPED: dict[str, str] = {}
 # Whole experiments and diagnoses, though small ones: seconds each.
@@ -50,7 +49,6 @@ SLOW = frozenset(
         "avtorch.paper.reproduce.reproduce",
         "avtorch.paper.strategies.Strategies",
         "avtorch.paper.strategies.strategies",
-        "avtorch.pedals.held_out.held_out",
         "avtorch.plots.paper.paper_pictures",
         "avtorch.plots.posterior_figures.validation_figures",
         "avtorch.plots.signatures.signature_figure",
@@ -76,7 +74,7 @@ def examples(public: Public) -> list[doctest.Example]:
     return doctest.DocTestParser().get_examples(public.doc, str(public))
 
 
-RUN = [pytest.param(p, marks=pytest.mark.slow if str(p) in SLOW else []) for p in PUBLIC if str(p) not in WITHOUT]
+RUN = [pytest.param(p, marks=pytest.mark.slow if str(p) in SLOW else []) for p in PUBLIC if examples(p)]
 
 
 @pytest.mark.parametrize("public", RUN, ids=str)
@@ -91,8 +89,11 @@ def test_example_runs(public: Public, tmp_path: Path, monkeypatch: pytest.Monkey
     assert doctest.DocTestRunner(verbose=False).run(test, out=report.append).failed == 0, "".join(report)
 
 
-def test_only_names_without_example_are_listed() -> None:
-    assert {str(p) for p in PUBLIC if not examples(p)} == WITHOUT
+def test_what_a_page_names_has_an_example() -> None:
+    """A name of the first level has one, too; what a function returns is explained by the function's own."""
+    shown = {word for page in PAGES for code in _code(page) for word in re.findall(r"\w+", code)}
+    assert len(shown) > 500
+    assert not [str(p) for p in PUBLIC if p.name in shown | set(offered("avtorch")) and not examples(p)]
 
 
 def test_slow_ones_are_public_names() -> None:
@@ -121,6 +122,11 @@ def test_arrays_have_a_shape_or_a_unit() -> None:
     taking = [p for p in PUBLIC if _takes_arrays(p.node)]
     assert len(taking) > 40
     assert not [str(p) for p in taking if not said.search(p.doc.split("Example:")[0])]
+
+
+def _code(page: Path) -> list[str]:
+    text = page.read_text(encoding="utf-8")
+    return [text] if page.suffix == ".py" else re.findall(r"```.*?```|`[^`]+`", text, re.S)
 
 
 def _takes_arrays(node: ast.stmt | ast.Module) -> bool:

@@ -11,7 +11,7 @@ from avtorch.cli.talk import Talk
 if TYPE_CHECKING:
     from avtorch.arrays import FloatArray
     from avtorch.io import Log
-    from avtorch.pedals import HeldOut, PedalFit, PedalTable
+    from avtorch.pedals import PedalFit, PedalTable
 
 PICTURE = "pedal_map.png"
 FILES = ("pedal_map.csv", "accel_map.csv", "brake_map.csv", PICTURE)
@@ -26,25 +26,26 @@ def commanded(talk: Talk, drives: Sequence[Log]) -> tuple[list[Log], PedalFit | 
     """
     if any(drive.accel_cmd is not None or (not drive.pedals and drive.speed_cmd is None) for drive in drives):
         return list(drives), None, ""
-    from avtorch.pedals import fit_pedals, held_out
+    from avtorch.pedals import fit_pedals
 
     with talk.waiting("Fitting a map of the commands"):
         fit = fit_pedals(drives)
-        sentence = map_sentence(fit, held_out(drives))
+        sentence = map_sentence(fit)
     talk.lines([sentence, ""])
     return [fit.map.commanded(drive) for drive in drives], fit, sentence
 
 
-def map_sentence(fit: PedalFit, score: HeldOut) -> str:
+def map_sentence(fit: PedalFit) -> str:
     """What stands for the command, how good it is, and what it cannot tell."""
-    made = fit.map
+    made, score = fit.map, fit.held_out
     ranges = [f"{name} {_range(name, table.pedal)}" for name, table in made.pedals.items()]
     worth = "better" if score.better_than("factor") else "not surely better"
     names = " and ".join(made.pedals)
     said = (
         f"The log has no accel_cmd: a map of {names} and speed stands for it ({', '.join(ranges)}, speed "
-        f"{made.speed[0]:.3g} to {made.speed[-1]:.3g} m/s). On blocks held out its rollouts of {score.horizon_s:g} s "
-        f"miss speed by {score.rmse('map'):.2g} m/s, one constant factor by {score.rmse('factor'):.2g} m/s: {worth}. "
+        f"{made.speed[0]:.3g} to {made.speed[-1]:.3g} m/s). On blocks left out its free runs of "
+        f"{score.horizon_s:.2g} s miss speed by {score.rmse('map'):.2g} m/s, one constant factor by "
+        f"{score.rmse('factor'):.2g} m/s: {worth}. "
         "The map and K_L cannot be told apart: K_L is 1 by the map's scale."
     )
     if "speed_error" not in made.pedals:

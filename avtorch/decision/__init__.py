@@ -17,7 +17,6 @@ from avtorch.decision.replay import History, replay
 from avtorch.decision.settings import DesignBounds, Setting
 from avtorch.decision.strategist import Decision, Strategist
 from avtorch.decision.supervisor import Supervisor
-from avtorch.decision.trade_off import GapTradeOff, gap_trade_off
 from avtorch.decision.watch import Watch, WatchedWindow
 
 __all__ = [
@@ -29,7 +28,6 @@ __all__ = [
     "Decision",
     "DesignBounds",
     "Estimates",
-    "GapTradeOff",
     "Grid",
     "History",
     "Intrusiveness",
@@ -43,6 +41,5 @@ __all__ = [
     "WatchedWindow",
     "algorithm2",
     "estimate",
-    "gap_trade_off",
     "replay",
 ]

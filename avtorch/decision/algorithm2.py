@@ -41,14 +41,6 @@ class Algorithm2:
 
     `outside`: the estimate left the accepted boundary; `stable`: the result of the stability check (computed in every
     branch, so that it can be plotted); `lower_level_updated`, `time_gap_increased`, `gains_increased`: what was done.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.decision import Setting, algorithm2
-        >>> T_L, K_L = torch.tensor([0.3, 1.5], dtype=torch.float64), torch.tensor([1.0, 0.5], dtype=torch.float64)
-        >>> taken = algorithm2(T_L, K_L, Setting(scenarios=2), check="exact")  # a sound car and a degraded one
-        >>> taken.outside.tolist(), taken.lower_level_updated.tolist(), taken.setting.T_hat.tolist()
-        ([False, True], [False, True], [0.3, 1.5])
     """
 
     outside: Tensor

@@ -53,16 +53,7 @@ damps a slow one. k_s is kept, as it is neutral (paper, table on gains). The pap
 
 @dataclass(frozen=True)
 class Intrusiveness:
-    """Weights of the cost in the module docstring; `margin` is the strategist's price of a setting that barely passes.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.decision import Grid, Intrusiveness, Setting
-        >>> cautious = Grid(intrusiveness=Intrusiveness(gap=0.5))  # a longer time gap is thought of as cheap
-        >>> longer, fresh = Setting(time_gap=1.6), torch.tensor([False])
-        >>> [round(w(longer, Setting(), fresh).item(), 2) for w in (Intrusiveness(), cautious.intrusiveness)]
-        [3.3, 2.3]
-    """
+    """Weights of the cost in the module docstring; `margin` is the strategist's price of one that barely passes."""
 
     update: float = 1.0
     effort: float = 0.5

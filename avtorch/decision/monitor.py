@@ -32,24 +32,10 @@ from avtorch.errors import InputError
 from avtorch.inference.state import shaped_as
 
 DETECTORS = ("stability", "accepted_change", *DIVERGENCES, *CHARTS)
-"""All detectors, in order of precedence.
-
-Example:
-    >>> from avtorch.decision import DETECTORS, Monitor
-    >>> monitor = Monitor(detectors=DETECTORS)  # all of them
-    >>> len(DETECTORS), DETECTORS[0]  # the first takes precedence
-    (8, 'stability')
-"""
+"""All detectors, in order of precedence."""
 
 DEFAULT_DETECTORS = ("stability", "accepted_change")
-"""The detectors that alert by default.
-
-Example:
-    >>> from avtorch.decision import DEFAULT_DETECTORS, Monitor
-    >>> monitor = Monitor(detectors=(*DEFAULT_DETECTORS, "cusum"))
-    >>> monitor.detectors
-    ('stability', 'accepted_change', 'cusum')
-"""
+"""The detectors that alert by default."""
 
 
 @dataclass(frozen=True)
@@ -58,16 +44,6 @@ class MonitorReport:
 
     `alerts` by detector's name, in order of precedence, bool; `statistics` by name: the value each detector compared;
     `p_string_stable`, `p_local_stable` under the belief with the setting in force; `mean` (T_L [s], K_L [-]).
-
-    Example:
-        >>> import torch
-        >>> from avtorch.decision import Monitor, Setting
-        >>> T_L = torch.linspace(1.4, 1.6, 101, dtype=torch.float64).unsqueeze(0)  # (scenario, draw)
-        >>> report = Monitor().update(T_L, torch.full_like(T_L, 0.5), torch.tensor([True]), Setting())
-        >>> report.any.tolist(), report.p_string_stable.tolist()
-        ([True], [0.0])
-        >>> print(report.why("accepted_change"))
-        T_L 1.50 s, K_L 0.50 left the accepted values (0.30 s, 1.00) with probability 1.000
     """
 
     alerts: dict[str, Tensor]

@@ -16,14 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Alert:
-    """`detector` raised an alarm at `time_s`, the end of a window; `why` in one sentence.
-
-    Example:
-        >>> from avtorch.decision import Alert
-        >>> alert = Alert(time_s=28.0, detector="stability", why="P(string stable) is 0.02, below 0.90")
-        >>> f"{alert.time_s:g} s, {alert.detector}"
-        '28 s, stability'
-    """
+    """`detector` raised an alarm at `time_s`, the end of a window; `why` in one sentence."""
 
     time_s: float
     detector: str
@@ -37,13 +30,6 @@ class Action:
     `strategies` lead to `setting` (of shape ``(1,)``) from the default; `sufficient`: whether it meets the strategist's
     conditions. `peak_gain_true`: the exact peak gain at the true vehicle, None where the truth is unknown.
     `driver_delay_s`: where a driver was asked for the time gap, how long until it begins to move; else 0.
-
-    Example:
-        >>> from avtorch.decision import Action, Setting
-        >>> why, longer = "P(string stable) fell to 0.02", Setting(time_gap=2.5)
-        >>> action = Action(28.0, [2], longer, why, sufficient=True, p_string_stable=0.98, peak_gain_true=1.0)
-        >>> action.setting.as_dict()["time_gap_s"]
-        2.5
     """
 
     time_s: float

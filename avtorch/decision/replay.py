@@ -30,14 +30,6 @@ class History:
     """The last seconds as logged: `lead_speed` [m/s], `lead_accel` [m/s²] (scenario, time) at steps of `dt` [s]; the
     follower's `spacing` [m] and `speed` [m/s] (scenario,) at the beginning. Raises `InputError` for other shapes, or
     fewer than two rows.
-
-    Example:
-        >>> from avtorch import ClosedLoop, Leader
-        >>> from avtorch.decision import History
-        >>> loop = ClosedLoop(Leader.default(start=50.0, duration=4.0, dt=0.05), scenarios=2)
-        >>> seen = History.of_blocks([loop.advance(40), loop.advance(40)], seconds=3.0)
-        >>> seen.seconds, tuple(seen.lead_speed.shape)
-        (3.0, (2, 61))
     """
 
     dt: float
@@ -133,16 +125,6 @@ def replay(
     received `link_delay` [s] late. Limits [m/s²] are numbers or (scenario,). The step is the logged one or a multiple
     of it, at most `dt` [s] and a sixth of the lag: holding a command for longer would make a fast car with a strong k_a
     oscillate, unlike the real loop.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.decision import History, Setting, replay
-        >>> steady = torch.full((1, 100), 20.0, dtype=torch.float64)
-        >>> seen = History(0.05, steady, 0 * steady, spacing=steady[:, 0] + 5, speed=steady[:, 0])
-        >>> gaps = Setting(time_gap=torch.tensor([[1.0, 1.6]]))  # two candidates of one scenario
-        >>> one = torch.ones(1, dtype=torch.float64)
-        >>> replay(seen, gaps, T_L=1.5 * one, K_L=0.5 * one, time_gap_now=one).clipped_share.tolist()
-        [[0.0, 0.0]]
     """
     strides = (torch.clamp_max(T_L / 6.0, dt) / history.dt + 1e-9).long().clamp(1, history.lead_speed.shape[1] - 1)
     out: Prediction | None = None

@@ -52,17 +52,6 @@ class Decision:
     `strategies` lead from the default to the choice; `changes`: it differs from the setting in force. `why`: one
     sentence each. `interim`: the setting until the driver has set the longer time gap, `p_interim` its P(string
     stable), `driver_delay_s` the time allowed for it; where no driver is asked, 0 and the choice itself.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.decision import Grid, History, Setting, Strategist
-        >>> T_L, K_L = torch.full((1, 50), 1.5, dtype=torch.float64), torch.full((1, 50), 0.5, dtype=torch.float64)
-        >>> steady = torch.full((1, 100), 20.0, dtype=torch.float64)
-        >>> seen = History(0.05, steady, 0 * steady, spacing=steady[:, 0] + 5, speed=steady[:, 0])
-        >>> only_gap = Strategist(grid=Grid(allowed=frozenset({2})))
-        >>> decision = only_gap.decide(T_L, K_L, seen, current=Setting(), default=Setting())
-        >>> decision.sufficient.item(), decision.strategies, decision.setting.time_gap.item()
-        (True, [{2}], 2.5)
     """
 
     setting: Setting

@@ -17,15 +17,7 @@ from avtorch.inference.stream import BeliefStream, Window
 
 @dataclass(frozen=True, repr=False)
 class WatchedWindow(Displayed):
-    """A window's belief and the monitor's report on it under the `setting` in force.
-
-    Example:
-        >>> from avtorch import GLVDPlant, Leader, estimate, simulate
-        >>> run = simulate(Leader.default(start=50.0, duration=2.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-        >>> watched = estimate(run.log(), estimator="map").windows[0]
-        >>> watched.window.end_s, watched.report.p_string_stable.tolist(), watched.setting.time_gap.item()
-        (2.0, [1.0], 1.0)
-    """
+    """A window's belief and the monitor's report on it under the `setting` in force."""
 
     window: Window
     report: MonitorReport
@@ -43,16 +35,6 @@ class Watch:
     """A `stream` of beliefs about many vehicles with a `monitor` behind it, one scenario a vehicle.
 
     Raises `InputError` where their numbers of vehicles and scenarios differ.
-
-    Example:
-        >>> from avtorch import BeliefStream, GLVDPlant, Leader, Setting, simulate
-        >>> from avtorch.decision import Watch
-        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(1.5, 0.5))
-        >>> rows = {"accel": run.accel[:, 0], "accel_cmd": run.accel_cmd[:, 0], "jerk": run.jerk[:, 0]}
-        >>> watch = Watch(BeliefStream(check_units=False, estimator="map"))
-        >>> windows = watch.feed(run.time, rows, Setting()) + watch.flush(Setting())
-        >>> [w.report.names() for w in windows]
-        [['stability', 'accepted_change'], ['stability', 'accepted_change']]
     """
 
     def __init__(self, stream: BeliefStream, monitor: Monitor | None = None) -> None:

@@ -16,16 +16,7 @@ _SENTENCE = 600  # characters
 
 @dataclass(frozen=True)
 class Card:
-    """A `title`, `lines` of one sentence each, and a `table`, of which `most` rows are drawn.
-
-    Example:
-        >>> from avtorch.display import Card, Frame
-        >>> print(Card("Belief about one car", ("Not excited.",), Frame({"parameter": ("T_L",), "mean": (0.3,)})))
-        Belief about one car
-        Not excited.
-        parameter  mean
-        T_L         0.3
-    """
+    """A `title`, `lines` of one sentence each, and a `table`, of which `most` rows are drawn."""
 
     title: str
     lines: tuple[str, ...] = ()
@@ -46,19 +37,7 @@ class Card:
 
 
 class Displayed:
-    """An answer that shows its `overview()`: as text in a console, as HTML in a notebook.
-
-    Example:
-        >>> from avtorch.display import Card, Displayed
-        >>> class Answer(Displayed):
-        ...     def overview(self) -> Card:
-        ...         return Card("42 m/s", ("It is < 50.",))
-        >>> Answer()
-        42 m/s
-        It is < 50.
-        >>> Answer()._repr_html_()
-        '<div><strong>42 m/s</strong><div>It is &lt; 50.</div></div>'
-    """
+    """An answer that shows its `overview()`: as text in a console, as HTML in a notebook."""
 
     def overview(self) -> Card:
         """The answer in a few lines."""

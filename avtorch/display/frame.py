@@ -29,13 +29,6 @@ class Frame:
 
     `to_dataframe()` makes a pandas data frame; Polars, DuckDB and pyarrow take the table itself, by Arrow's protocol
     (``polars.DataFrame(frame)``). Raises `InputError` where columns differ in length.
-
-    Example:
-        >>> from avtorch.display import Frame
-        >>> Frame({"parameter": ("T_L", "K_L"), "unit": ("s", "-"), "mean": (0.31234, 1.0)})
-        parameter  unit    mean
-        T_L        s     0.3123
-        K_L        -          1
     """
 
     columns: Mapping[str, Column]

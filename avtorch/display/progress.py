@@ -57,14 +57,6 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
 
     It stands below the cell in a notebook, and on standard error where that is a terminal. Elsewhere, within another
     bar and in the first second there is none. At the end it is gone.
-
-    Example:
-        >>> from avtorch.display import progress_bar
-        >>> with progress_bar("driving") as step:
-        ...     for lap in range(3):
-        ...         step(f"lap {lap + 1}", lap, 3)
-        >>> print("driven")
-        driven
     """
     bar = NoBar() if _shown.get() else bar_here()
     token = _shown.set(True)

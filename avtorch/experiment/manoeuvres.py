@@ -113,14 +113,7 @@ _PUSH = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Manoeuvre:
-    """`command` (row,) [m/s²] at `time` (row,) [s], and the `speed` (row,) [m/s] that is expected of the car.
-
-    Example:
-        >>> from avtorch.experiment import library
-        >>> manoeuvre = library()[0]
-        >>> manoeuvre.time.shape == manoeuvre.command.shape, manoeuvre.metres <= 2000.0, manoeuvre.effort > 0
-        (True, True, True)
-    """
+    """`command` (row,) [m/s²] at `time` (row,) [s], and the `speed` (row,) [m/s] that is expected of the car."""
 
     name: str
     time: FloatArray = field(repr=False)

@@ -144,14 +144,6 @@ def write_table(experiment: Experiment | None, folder: str | PathLike[str]) -> l
 
     A command holds until the next row's time. Where there is no experiment, an earlier table in the folder is removed.
     Raises `InputError` where the folder cannot be written.
-
-    Example:
-        >>> from avtorch.experiment import Experiment, Information, library, write_table
-        >>> manoeuvre, expected = library()[0], Information(0.6, 0.95, 4.0)
-        >>> experiment = Experiment(manoeuvre, ("dead_time", "rate_limit"), expected, entropy=0.69, every={})
-        >>> path, = write_table(experiment, "out")
-        >>> path.read_text().splitlines()[0]
-        'time,accel_cmd,speed_expected'
     """
     path = Path(folder) / "manoeuvre.csv"
     if experiment is None:

@@ -20,12 +20,6 @@ class RankAgreement:
     """`srcc`: rank correlation of the simulated and the real scores, from -1 to 1. `p_value`: how often orders by pure
     chance agree as well. `chosen`: the best setting by the simulator, `best`: on the car; `regret`: by how much
     `chosen` scores worse there, in the scores' own unit.
-
-    Example:
-        >>> from avtorch.experiment import rank_agreement
-        >>> found = rank_agreement({"a": 1.0, "b": 2.0, "c": 3.0}, {"a": 0.6, "b": 0.5, "c": 0.9})
-        >>> found.srcc, found.chosen, found.best, round(found.regret, 1)
-        (0.5, 'a', 'b', 0.1)
     """
 
     srcc: float

@@ -31,25 +31,7 @@ _SWEEP_S, _SWEEP_HZ = 20.0, (0.05, 1.5)
 
 @dataclass(frozen=True, repr=False)
 class SimulatorCheck(Displayed):
-    """What a simulator called `name` does, as a chain of effects (`surrogate`), and the `output` it was found from.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.external import check_simulator
-        >>> class Mine:
-        ...     lag = 0.4
-        ...     def reset(self, *, speed, accel):
-        ...         self.speed, self.accel, self.late = speed, accel, [accel] * 10
-        ...     def step(self, accel_cmd, dt):
-        ...         self.late.append(accel_cmd)
-        ...         before, u = self.accel, self.late.pop(0)
-        ...         self.accel = u + np.exp(-dt / self.lag) * (before - u)
-        ...         self.speed += dt * (before + self.accel) / 2
-        ...         return self.accel, self.speed
-        >>> found = check_simulator(Mine())
-        >>> {name: round(value, 2) for name, value in found.values.items()}  # ten steps of 20 ms
-        {'T_L': 0.4, 'K_L': 1.0, 'dead_time.delay_s': 0.2}
-    """
+    """What a simulator called `name` does, as a chain of effects (`surrogate`), and the `output` it was found from."""
 
     name: str
     surrogate: Surrogate

@@ -20,15 +20,6 @@ def load_simulator(text: str, *, mapping: str | PathLike[str] | None = None) -> 
     `mapping`: a TOML file that names an FMU's variables, see `FmuSimulator`.
     Raises `InputError` for a text of another form, a module or name that is not there, what cannot be made, or an
     object without `reset` and `step`.
-
-    Example:
-        >>> from avtorch import InputError
-        >>> from avtorch.external import load_simulator
-        >>> try:
-        ...     load_simulator("math:sqrt")
-        ... except InputError as error:
-        ...     print(str(error).split(";")[0])
-        simulator: math:sqrt raised TypeError when called without arguments
     """
     if text.lower().endswith(".fmu"):
         return FmuSimulator(text, mapping=mapping)

@@ -99,16 +99,6 @@ class SimulatorComparison(Displayed):
     """`errors` by metric: root mean squares over rollouts of `horizon_s` [s]. `ratio`: the second's error relative to
     the first's, the geometric mean over the metrics. `p_first`, `p_second`: probability that it is nearer, by 1 % of
     its error at least, from the spread between `blocks` blocks of the drives. `differences`: what matters most first.
-
-    Example:
-        >>> from avtorch import Leader, compare_simulators, simulate
-        >>> from avtorch.gap import plant
-        >>> log = simulate(Leader.default(start=30.0, duration=60.0, dt=0.1), plant=plant(T_L=0.5)).log()
-        >>> told = compare_simulators(log, "T_L=0.5", "T_L=0.2, K_L=0.9")
-        >>> print(told.why.partition(",")[0])
-        The first simulator is nearer to the car
-        >>> [(d.name, d.brings_nearer) for d in told.differences]
-        [('K_L', True), ('T_L', True)]
     """
 
     log: LogFacts

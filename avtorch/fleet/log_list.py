@@ -267,14 +267,7 @@ CarFrom = Literal["manifest", "folder", "file"]
 
 @dataclass(frozen=True)
 class FleetLog:
-    """A log of a fleet: its `place` (path or URL), `car`, `date` (ISO 8601, None: not known) and further `tags`.
-
-    Example:
-        >>> from avtorch.fleet import FleetLog
-        >>> log = FleetLog("logs/car_7/monday.csv", "car_7", "2026-11-23", {"route": "A9"})
-        >>> log.file_name.startswith("monday-"), log.car
-        (True, 'car_7')
-    """
+    """A log of a fleet: its `place` (path or URL), `car`, `date` (ISO 8601, None: not known) and further `tags`."""
 
     place: str
     car: str
@@ -300,13 +293,7 @@ class FleetLog:
 
 @dataclass(frozen=True)
 class LogList:
-    """The `logs` of a fleet, and where the names of the cars are from.
-
-    Example:
-        >>> from avtorch.fleet import FleetLog, LogList
-        >>> LogList((FleetLog("a.csv", "a"),), "file").car_from
-        'file'
-    """
+    """The `logs` of a fleet, and where the names of the cars are from."""
 
     logs: tuple[FleetLog, ...]
     car_from: CarFrom
@@ -325,16 +312,6 @@ def find_logs(
 
     Raises `InputError` where a source has no log, for a manifest beside other sources, and for errors in a manifest by
     line and column.
-
-    Example:
-        >>> from pathlib import Path
-        >>> from avtorch.fleet import find_logs
-        >>> for name in ("red/monday.csv", "red/tuesday.csv", "blue/monday.csv"):
-        ...     Path("logs", name).parent.mkdir(parents=True, exist_ok=True)
-        ...     _ = Path("logs", name).write_text("time,accel_cmd,speed")
-        >>> found = find_logs("logs")
-        >>> [log.car for log in found.logs], found.car_from
-        (['blue', 'red', 'red'], 'folder')
     """
     given = [os.fspath(s) for s in ([sources] if isinstance(sources, (str, os.PathLike)) else sources)]
     if not given:

@@ -42,15 +42,6 @@ class FollowerDiagnosis(Displayed):
     - `stability` about slow, usual and quick speeds of the drive
     - `diagnosis`: gap and cause on the test half, conditional on the law; None where it was not requested
     - `conditional`: the condition that each claim rests on, one sentence each
-
-    Example:
-        >>> from avtorch import Leader, LinearController, simulate
-        >>> from avtorch.follower import FollowerDiagnosis, diagnose_follower
-        >>> car = LinearController(gains=(0.2, 0.6, 0.0), time_gap=1.5)
-        >>> log = simulate(Leader.default(start=50.0, duration=45.0, dt=0.1), car).log()
-        >>> found: FollowerDiagnosis = diagnose_follower(log, law="constant_time_gap", cause=False)
-        >>> sorted(found.loops), len(found.stability), found.diagnosis is None
-        (['constant_time_gap', 'without_delay'], 3, True)
     """
 
     name: str

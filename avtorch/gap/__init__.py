@@ -26,6 +26,7 @@ from avtorch.gap.effects import (
     GainChange,
     GearShift,
     Gust,
+    HandOver,
     LowSpeedCreep,
     Outliers,
     RateLimit,
@@ -37,6 +38,7 @@ from avtorch.gap.effects import (
     SensorScale,
     SpeedDependentGain,
     SpeedDependentLag,
+    ViscousDrag,
 )
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.effect import EFFECTS, PLACES, Effect, NoiseChange, effect_class, register
@@ -74,6 +76,7 @@ __all__ = [
     "GapPlant",
     "GearShift",
     "Gust",
+    "HandOver",
     "LowSpeedCreep",
     "NoiseChange",
     "Outliers",
@@ -92,6 +95,7 @@ __all__ = [
     "SpeedDependentGain",
     "SpeedDependentLag",
     "Unexplained",
+    "ViscousDrag",
     "effect_class",
     "effects",
     "gap_budget",

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from avtorch.deprecation import deprecated
 from avtorch.errors import InputError
 from avtorch.inference.units import UNITS as UNITS
 
@@ -46,9 +45,3 @@ def inference_data(
     coords = {dim: range(size) for dim, size in sizes}
     attrs = {"inference_library": "avtorch", **attributes}
     return arviz.InferenceData(posterior=xarray.Dataset(variables, coords=coords, attrs=attrs))
-
-
-def to_arviz(posterior: Any, *, window: int | None = None) -> InferenceData:
-    """Deprecated: write ``posterior.to_arviz(window=window)``."""
-    deprecated("arviz_export.to_arviz(posterior)", "posterior.to_arviz()", until="0.3")
-    return posterior.to_arviz(window=window)

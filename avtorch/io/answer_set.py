@@ -49,17 +49,6 @@ def answer_set(folder: str | os.PathLike[str], names: Sequence[str]) -> Iterator
     answer into `folder` meanwhile.
 
     Raises InputError where `folder` cannot be written or is in use, ValueError for a file that `names` does not have.
-
-    Example:
-        >>> from avtorch.io import answer_set, read_answer, write_json
-        >>> with answer_set("out", ["estimates.json", "estimates.csv"]) as folder:
-        ...     write_json(folder / "estimates.json", {"T_L": 0.3})
-        ...     _ = (folder / "estimates.csv").write_text("T_L,0.3")
-        >>> from pathlib import Path
-        >>> sorted(path.name for path in Path("out").iterdir())
-        ['estimates.csv', 'estimates.json']
-        >>> list(read_answer("out/estimates.json")["files"])
-        ['estimates.csv']
     """
     place = Path(folder)
     if place in _staged:

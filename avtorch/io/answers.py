@@ -21,15 +21,6 @@ def write_json(path: str | os.PathLike[str], obj: Any) -> None:
     Accepts dicts with string keys, lists, tuples, strings, numbers, booleans and None, and objects with ``tolist``
     (NumPy arrays and scalars, tensors). Control characters and other invisible ones are escaped. Raises
     InputError, naming the key, for NaN, infinity or a foreign type; nothing is written then, and an earlier file stays.
-
-    Example:
-        >>> import json
-        >>> import numpy as np
-        >>> from pathlib import Path
-        >>> from avtorch.io import write_json
-        >>> write_json("answer.json", {"T_L": np.array([0.25, 0.5]), "excited": True})
-        >>> json.loads(Path("answer.json").read_text())
-        {'T_L': [0.25, 0.5], 'excited': True}
     """
     text = json_text(obj)
     with atomic(path) as stream:

@@ -18,18 +18,6 @@ def atomic(path: str | os.PathLike[str], *, binary: bool = False) -> Iterator[IO
 
     Missing folders are made. If the block raises, the temporary file is removed and ``path`` is unchanged.
     Raises InputError where the place cannot be written.
-
-    Example:
-        >>> from pathlib import Path
-        >>> from avtorch.io import atomic
-        >>> _ = Path("table.csv").write_text("old")
-        >>> try:
-        ...     with atomic("table.csv") as file:
-        ...         _ = file.write("half of the new")
-        ...         raise KeyboardInterrupt
-        ... except KeyboardInterrupt:
-        ...     print(Path("table.csv").read_text())
-        old
     """
     target = Path(path)
     try:

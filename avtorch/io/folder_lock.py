@@ -33,12 +33,6 @@ def sole_use(folder: str | os.PathLike[str], *, work: str) -> Iterator[bool]:
 
     Raises `InputError` that names the other process (pid, host, command, since when), or gives the reason why the
     folder cannot be written.
-
-    Example:
-        >>> from avtorch.io import sole_use
-        >>> with sole_use("out", work="a diagnosis") as locked:
-        ...     print(locked)
-        True
     """
     place = Path(folder)
     made = _make(place)

@@ -35,14 +35,6 @@ class RawLeader:
     ``time`` [s] is the file's own, strictly rising; ``speed`` [m/s] >= 0; ``accel`` [m/s^2] and ``spacing`` [m, to the
     vehicle ahead, bumper to bumper; NaN where not recorded] are None where the file has none. ``events``: the joined
     events, in order. ``note``: what was selected, cut or repaired, in words; empty where nothing was.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.io import RawLeader
-        >>> time = np.arange(0.0, 5.0, 0.1)
-        >>> leader = RawLeader(time, speed=20 - time, accel=None, spacing=None, name="braking")
-        >>> leader.name, leader.speed.shape
-        ('braking', (50,))
     """
 
     time: FloatArray
@@ -340,15 +332,6 @@ def read_leader(
     are joined at equal speed until they last ``duration`` [s] (default 80). ``unit`` (``speed=km/h``) is for the plain
     form. A recording is cut to its longest stretch without empty speeds or steps over 1.5 s; ``note`` records the cut.
     Raises InputError for a file of no known form, a vehicle or event that is not in it, and bad values.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.io import read_leader
-        >>> time = np.arange(0.0, 5.0, 0.1)
-        >>> np.savetxt("lead.csv", np.c_[time, 72 - 3.6 * time], delimiter=",", header="time,speed", comments="")
-        >>> leader = read_leader("lead.csv", unit="speed=km/h")
-        >>> [round(v, 1) for v in leader.speed[[0, -1]].tolist()]
-        [20.0, 15.1]
     """
     table = read_table(path, header="Time", wanted=recorded)
     names = set(table.names)

@@ -37,14 +37,6 @@ STANDSTILL_SHARE = 0.1
 STANDSTILL_MPS = 0.3
 """Below this speed [m/s] GLVD does not hold; such rows are masked. What never goes ten times as fast, a small robot,
 stands below a tenth of its own top speed (`Log.standstill_mps`).
-
-Example:
-    >>> import numpy as np
-    >>> from avtorch.io import STANDSTILL_MPS, Log
-    >>> speed = np.linspace(0.0, 5.0, 200)
-    >>> log = Log.from_arrays(time=0.1 * np.arange(200), accel_cmd=np.full(200, 0.25), speed=speed)
-    >>> bool(speed[log.usable].min() > STANDSTILL_MPS)
-    True
 """
 
 AccelKind = Literal["kinematic", "specific-force"]

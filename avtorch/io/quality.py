@@ -27,17 +27,7 @@ SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead
 
 @dataclass(frozen=True)
 class Gap:
-    """A gap begins after ``row`` (of the log, from 1) at ``start_s`` on the log's time and lasts ``seconds``.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.io import Log, check
-        >>> time = np.concatenate([np.arange(0, 10, 0.1), np.arange(15, 25, 0.1)])
-        >>> log = Log.from_arrays(time=time, accel_cmd=np.sin(time), speed=20 - np.cos(time))
-        >>> gap, = check(log).gaps
-        >>> gap.row, round(gap.start_s, 1), round(gap.seconds, 1)
-        (100, 9.9, 5.1)
-    """
+    """A gap begins after ``row`` (of the log, from 1) at ``start_s`` on the log's time and lasts ``seconds``."""
 
     row: int
     start_s: float
@@ -54,16 +44,6 @@ class Quality:
     ``returns`` to engaged and ``standstill_rows`` below 0.3 m/s, or a
     tenth of the top speed where that is less, or, without speed, classified as standing; ``notes``:
     all of it in sentences.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.io import Log, check
-        >>> time = np.arange(0.0, 20.0, 0.05)
-        >>> engaged = (time < 5) | (time > 8)  # the driver takes over for 3 s
-        >>> log = Log.from_arrays(time=time, accel_cmd=np.sin(time), speed=20 - np.cos(time), engaged=engaged)
-        >>> quality = check(log)
-        >>> quality.driver_rows, quality.returns, quality.settling_rows
-        (61, 1, 40)
     """
 
     rows: int

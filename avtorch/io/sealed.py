@@ -37,33 +37,11 @@ _FIRST = re.compile(rb'\{"schema": "([a-z0-9_./-]{1,80})", "sha256": "([0-9a-f]{
 
 
 class Damaged(InputError):
-    """Raised for a regular file whose content is damaged; the caller may compute it again.
-
-    Example:
-        >>> from pathlib import Path
-        >>> from avtorch.io import Damaged, read_sealed, write_sealed
-        >>> path = Path("fit.json")
-        >>> write_sealed(path, {"T_L": 0.3}, schema="fit/1", of={"log": "drive.csv"})
-        >>> _ = path.write_text(path.read_text().replace("0.3", "0.4"))
-        >>> try:
-        ...     read_sealed(path, schema="fit/1")
-        ... except Damaged:
-        ...     print("computed again")
-        computed again
-    """
+    """Raised for a regular file whose content is damaged; the caller may compute it again."""
 
 
 class Sealed(NamedTuple):
-    """What a file belongs to (`of`), and its `content`: from JSON, or bytes.
-
-    Example:
-        >>> from pathlib import Path
-        >>> from avtorch.io import read_sealed, write_sealed
-        >>> write_sealed(Path("fit.json"), {"T_L": 0.3}, schema="fit/1", of={"log": "drive.csv"})
-        >>> found = read_sealed(Path("fit.json"), schema="fit/1")
-        >>> found.of, found.content
-        ({'log': 'drive.csv'}, {'T_L': 0.3})
-    """
+    """What a file belongs to (`of`), and its `content`: from JSON, or bytes."""
 
     of: dict[str, Any]
     content: Any
@@ -73,13 +51,6 @@ def write_sealed(path: Path, content: Any, *, schema: str, of: Mapping[str, Any]
     """Write `content` (bytes, or what `json_text` accepts) so that `path` is complete or unchanged.
 
     `of`: what it belongs to. Raises `InputError` where `path` cannot be written, or is a symlink, a folder, a device.
-
-    Example:
-        >>> from pathlib import Path
-        >>> from avtorch.io import read_sealed, write_sealed
-        >>> write_sealed(Path("fit.json"), {"T_L": 0.3}, schema="fit/1", of={"seed": 7})
-        >>> read_sealed(Path("fit.json"), schema="fit/1").of
-        {'seed': 7}
     """
     _free_or_regular(path)
     if isinstance(content, bytes):
@@ -98,28 +69,13 @@ def read_sealed(path: Path, *, schema: str, most: int = MOST, remedy: str = REME
 
     `most`: bytes, above which the file is not read. `remedy`: advice to the user, the end of every message. Raises
     `InputError` for what is no regular file, `Damaged` for anything but a file of this `schema` as it was written.
-
-    Example:
-        >>> from pathlib import Path
-        >>> from avtorch.io import read_sealed, write_sealed
-        >>> write_sealed(Path("fit.json"), {"T_L": 0.3}, schema="fit/1", of={"log": "drive.csv"})
-        >>> read_sealed(Path("fit.json"), schema="fit/1").content["T_L"]
-        0.3
     """
     found = _parsed(b"{" + _verified(path, schema, most, remedy), path, schema, "content", remedy)
     return Sealed(found["of"], found["content"])
 
 
 def read_sealed_bytes(path: Path, *, schema: str, most: int = MOST, remedy: str = REMEDY) -> Sealed:
-    """The same of a file with bytes as its content.
-
-    Example:
-        >>> from pathlib import Path
-        >>> from avtorch.io import read_sealed_bytes, write_sealed
-        >>> write_sealed(Path("state.bin"), b"weights", schema="state/1", of={"log": "drive.csv"})
-        >>> read_sealed_bytes(Path("state.bin"), schema="state/1").content
-        b'weights'
-    """
+    """The same of a file with bytes as its content."""
     line, _, content = _verified(path, schema, most, remedy).partition(b"\n")
     found = _parsed(b"{" + line, path, schema, "bytes", remedy)
     if found["bytes"] != len(content):

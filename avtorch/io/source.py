@@ -11,17 +11,7 @@ from avtorch.io.log import Log
 from avtorch.io.mapping import Pairs
 
 LogSource = Log | str | os.PathLike[str] | DataFrame
-"""A log, a path to one, or a data frame with its columns.
-
-Example:
-    >>> import pyarrow as pa
-    >>> from avtorch.io import LogSource, as_log
-    >>> def rows(log: LogSource) -> int:
-    ...     return as_log(log).rows
-    >>> time = [0.1 * i for i in range(50)]
-    >>> rows(pa.table({"time": time, "accel_cmd": [0.5] * 50, "speed": [10 + 0.5 * t for t in time]}))
-    50
-"""
+"""A log, a path to one, or a data frame with its columns."""
 
 
 def as_log(
@@ -31,13 +21,6 @@ def as_log(
 
     `argument`: its name in messages. Raises `InputError` for anything else, and for what `Log.read` and
     `Log.from_dataframe` refuse.
-
-    Example:
-        >>> import pandas
-        >>> from avtorch.io import as_log
-        >>> drive = pandas.DataFrame({"t": [0.0, 0.1, 0.2], "accel_cmd": [0.5, 0.5, 0.5], "v": [36.0, 36.2, 36.4]})
-        >>> as_log(drive, map={"time": "t", "speed": "v"}, unit={"speed": "km/h"}).speed.round(2).tolist()
-        [10.0, 10.06, 10.11]
     """
     if isinstance(given, Log):
         for name, pairs in (("map", map), ("unit", unit)):
@@ -58,16 +41,7 @@ def as_log(
 def as_logs(
     given: LogSource | Sequence[LogSource], *, map: Pairs = None, unit: Pairs = None, argument: str = "logs"
 ) -> list[Log]:
-    """One log or several, each as `as_log` takes it, all with the same `map` and `unit`.
-
-    Example:
-        >>> from avtorch import Leader, simulate
-        >>> from avtorch.io import as_logs
-        >>> log = simulate(Leader.default(start=50.0, duration=5.0, dt=0.05)).log()
-        >>> log.write("drive.csv")
-        >>> [one.name for one in as_logs(["drive.csv", log])]
-        ['drive.csv', 'arrays']
-    """
+    """One log or several, each as `as_log` takes it, all with the same `map` and `unit`."""
     if isinstance(given, (Log, str, os.PathLike)) or is_dataframe(given):
         return [as_log(given, map=map, unit=unit, argument=argument)]  # pyright: ignore[reportArgumentType]
     if isinstance(given, dict) or not hasattr(given, "__iter__"):

@@ -32,17 +32,6 @@ class KeptCars:
     """The states in `folder`, of a watch of the source called `identity`.
 
     Raises `InputError` where the folder cannot be used.
-
-    Example:
-        >>> from avtorch.live import Batch, KeptCars, LiveWatch, Row
-        >>> watch, kept = LiveWatch(), KeptCars("state")
-        >>> rows = [Row("red", 0.01 * i, {"accel_cmd": 0.5, "speed": 20.0 + 0.005 * i}) for i in range(50)]
-        >>> _ = watch.take(Batch(rows))
-        >>> kept.write(watch)
-        >>> again = LiveWatch()
-        >>> _ = KeptCars("state").restore(again)
-        >>> list(again.cars), again.counts.rows
-        (['red'], 50)
     """
 
     def __init__(self, folder: str | Path, identity: str | None = None) -> None:

@@ -91,14 +91,6 @@ class FileSource:
     """Lines of a file; with `follow`, also those written to it later, and those of a file that takes its place.
 
     Raises `InputError` where it cannot be read.
-
-    Example:
-        >>> from pathlib import Path
-        >>> from avtorch.live import Counts, FileSource, LineParser, Stop
-        >>> _ = Path("rows.csv").write_text("car,time,accel_cmd,speed\\nred,0.01,0.5,20.0\\nred,0.02,0.5,20.0\\n")
-        >>> source = FileSource("rows.csv", LineParser(Counts()))
-        >>> [(row.time, row.position) for batch in source.batches(Stop()) for row in batch.rows]  # bytes behind the row
-        [(0.01, 43), (0.02, 61)]
     """
 
     def __init__(self, path: str | os.PathLike[str], parser: LineParser, *, follow: bool = False) -> None:

@@ -25,21 +25,7 @@ class Answer(NamedTuple):
 
 
 class LiveWatch:
-    """Watches of many cars, one each, made when a car's first row comes.
-
-    Example:
-        >>> from avtorch import GLVDPlant, Leader, simulate
-        >>> from avtorch.live import Batch, LiveWatch, Row
-        >>> run = simulate(Leader.default(start=50.0, duration=5.0, dt=0.02), plant=GLVDPlant(1.5, 0.5))
-        >>> columns = {name: getattr(run, name).flatten().tolist() for name in ("accel_cmd", "accel", "jerk")}
-        >>> signals = [dict(zip(columns, row)) for row in zip(*columns.values())]
-        >>> rows = [Row("red", t, x) for t, x in zip(run.time.tolist(), signals)]
-        >>> watch = LiveWatch()
-        >>> for answer in watch.take(Batch(rows)):
-        ...     print(answer.car, answer.entry["end_s"], answer.entry["alerts"])
-        red 2.0 ['stability', 'accepted_change']
-        red 4.0 ['stability', 'accepted_change']
-    """
+    """Watches of many cars, one each, made when a car's first row comes."""
 
     def __init__(self, settings: LiveSettings | None = None, counts: Counts | None = None) -> None:
         self.settings = LiveSettings() if settings is None else settings

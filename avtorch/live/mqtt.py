@@ -36,14 +36,7 @@ _NEED = "needs mqtt://HOST:PORT/TOPIC"
 
 @dataclass(frozen=True)
 class MqttAddress:
-    """A broker and a topic, from `mqtt://[USER:PASSWORD@]HOST[:PORT]/TOPIC`; `mqtts` for TLS.
-
-    Example:
-        >>> from avtorch.live import MqttAddress
-        >>> address = MqttAddress.of("mqtt://localhost/cars/+/rows")
-        >>> address.host, address.port, address.topic
-        ('localhost', 1883, 'cars/+/rows')
-    """
+    """A broker and a topic, from `mqtt://[USER:PASSWORD@]HOST[:PORT]/TOPIC`; `mqtts` for TLS."""
 
     host: str
     port: int
@@ -120,12 +113,6 @@ class MqttSource:
     A row without `car` is of the car named as its topic. With a `client_id` the broker keeps messages while the watch
     is not connected. Raises `InputError` where paho-mqtt is missing, and from `batches` for a broker that cannot be
     reached at the start or that refuses.
-
-    Example:
-        >>> from avtorch.live import Counts, LineParser, MqttAddress, MqttSource
-        >>> source = MqttSource(MqttAddress.of("mqtt://localhost/cars/+"), LineParser(Counts(), unit=["speed=km/h"]))
-        >>> source.name
-        'mqtt://localhost:1883/cars/+'
     """
 
     identity = None
@@ -191,15 +178,6 @@ class MqttSink:
     """Answers to a topic, one message each, at least once (QoS 1).
 
     Raises `InputError` where paho-mqtt is missing, the broker cannot be reached, or the topic has wildcards.
-
-    Example:
-        >>> from avtorch import InputError
-        >>> from avtorch.live import MqttAddress, MqttSink
-        >>> try:
-        ...     MqttSink(MqttAddress.of("mqtt://localhost/answers/#"))
-        ... except InputError as error:
-        ...     print(error)
-        mqtt://localhost:1883/answers/#: answers need one topic, without + and #
     """
 
     def __init__(self, address: MqttAddress, stop: Stop | None = None) -> None:

@@ -27,16 +27,6 @@ class PlayedLog:
 
     `rate`: how many times faster than recorded; None is as fast as they are taken. Raises `InputError` as `Log.read`,
     for a log without a command, and for a rate that is not positive.
-
-    Example:
-        >>> from avtorch import GLVDPlant, Leader, simulate
-        >>> from avtorch.live import LiveWatch, PlayedLog, watch_source
-        >>> run = simulate(Leader.default(start=50.0, duration=5.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-        >>> run.log().write("drive.parquet")
-        >>> watch = LiveWatch()
-        >>> watch_source(PlayedLog("drive.parquet"), watch, [])
-        >>> list(watch.cars), watch.counts.windows
-        (['drive'], 3)
     """
 
     def __init__(

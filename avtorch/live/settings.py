@@ -32,11 +32,6 @@ class LiveSettings:
     most; `check_units`: refuse columns that contradict each other; `seed`.
 
     Raises `InputError` for numbers out of range.
-
-    Example:
-        >>> from avtorch.live import LiveSettings
-        >>> LiveSettings(estimator="sgld").lateness
-        0.05
     """
 
     window: float = 2.0

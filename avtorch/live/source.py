@@ -26,11 +26,6 @@ from avtorch.numeral import numeral
 class Row(NamedTuple):
     """One row of one car: its `time` [s] on the car's own clock, and `signals` in SI units, as numbers or as a source
     found them. `position` in the source, None where it has none; it only ever grows.
-
-    Example:
-        >>> from avtorch.live import Row
-        >>> Row("red", 12.34, {"accel_cmd": 0.5, "accel": 0.4, "speed": 21.0}).car
-        'red'
     """
 
     car: str
@@ -44,11 +39,6 @@ class Batch:
     """Rows read at once, maybe none; `position` in the source behind them; `arrived` when (`time.monotonic`).
 
     `anew`: positions count from 0 again from this batch on, as where a file was replaced.
-
-    Example:
-        >>> from avtorch.live import Batch, Row
-        >>> len(Batch([Row("red", 0.0, {"accel_cmd": 0.5, "speed": 21.0})]).rows)
-        1
     """
 
     rows: list[Row]
@@ -147,15 +137,6 @@ class LineParser:
     where a row has none. What is no row is counted in `counts`.
 
     Raises `InputError` for a mapping or unit that is not known.
-
-    Example:
-        >>> from avtorch.live import Counts, LineParser
-        >>> counts = Counts()
-        >>> parser = LineParser(counts, unit=["speed=km/h"])
-        >>> parser.row(b'{"car": "red", "time": 1.5, "accel_cmd": 0.2, "speed": 72}')
-        Row(car='red', time=1.5, signals={'accel_cmd': 0.2, 'speed': 20.0}, position=None)
-        >>> parser.row(b'{"car": "red", "time":'), counts.to_dict()["refused"]
-        (None, {'corrupt': 1})
     """
 
     def __init__(self, counts: Counts, *, map: Pairs = None, unit: Pairs = None, car: str = "car") -> None:

@@ -52,14 +52,7 @@ def _answered(entry: Any) -> tuple[str, int]:
 
 
 class LineSink:
-    """Lines to an open text stream, standard output by default.
-
-    Example:
-        >>> from avtorch.live import Answer, LineSink
-        >>> LineSink().write(Answer({"car": "red", "alerts": []}, "red", 1, None))
-        {"car": "red", "alerts": []}
-        True
-    """
+    """Lines to an open text stream, standard output by default."""
 
     def __init__(self, stream: IO[str] | None = None) -> None:
         self._stream = sys.stdout if stream is None else stream
@@ -149,19 +142,6 @@ def watch_source(
     Memory is bounded: a batch is pulled once the one before it is answered and written.
 
     Raises `InputError` for a state that does not fit, and for what source and sinks raise.
-
-    Example:
-        >>> import io
-        >>> from avtorch.live import Batch, LineSink, LiveWatch, Row, watch_source
-        >>> class Steady:
-        ...     name, identity = "a steady drive", None
-        ...     def batches(self, stop, start=None):
-        ...         signals = {"accel_cmd": 0.0, "speed": 20.0}
-        ...         yield Batch([Row("red", 0.01 * i, signals) for i in range(250)])
-        >>> told, watch = io.StringIO(), LiveWatch()
-        >>> watch_source(Steady(), watch, [LineSink(told)])
-        >>> told.getvalue().count('"excited": false'), watch.counts.windows
-        (2, 2)
     """
     stop = Stop() if stop is None else stop
     position = None if kept is None else kept.restore(watch)

@@ -58,14 +58,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Estimation:
-    """The sweeps, one a leader; `seed` of the intervals.
-
-    Example:
-        >>> from avtorch.paper import Estimation, Leaders, estimation
-        >>> found: Estimation = estimation(Leaders.read(), seeds=2, seed=0)
-        >>> len(found.sweeps)  # behind US06, the one leader there is without recordings
-        1
-    """
+    """The sweeps, one a leader; `seed` of the intervals."""
 
     sweeps: list[Sweep]
     seed: int

@@ -57,12 +57,6 @@ _UNITS = {
 class Gains:
     """`measured`: by name, (gain, factor, seed). `peak` (gain, factor): exact, of the changed vehicle. `seed`: of the
     intervals.
-
-    Example:
-        >>> from avtorch.paper import Gains, Leaders, gains
-        >>> found: Gains = gains(Leaders.read(), seeds=2, seed=0)
-        >>> found.seed, tuple(found.peak.shape)
-        (0, (3, 4))
     """
 
     ahead: Ahead

@@ -143,14 +143,7 @@ class Watched:
 
 @dataclass(frozen=True)
 class Monitoring:
-    """The monitored runs, one per leader; `seed` of the intervals.
-
-    Example:
-        >>> from avtorch.paper import Leaders, Monitoring, monitoring
-        >>> found: Monitoring = monitoring(Leaders.read(), seeds=2, seed=0)
-        >>> len(found.watched), len(found.rows)
-        (1, 8)
-    """
+    """The monitored runs, one per leader; `seed` of the intervals."""
 
     watched: list[Watched]
     seed: int

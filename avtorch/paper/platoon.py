@@ -33,14 +33,7 @@ _WHOLE_S = 46.0  # long enough for the strategist's first choices
 
 @dataclass(frozen=True)
 class Platoon:
-    """`run` (setting, seed, vehicle, time), settings in the order of `names`; exact `peak` (setting,) at the truth.
-
-    Example:
-        >>> from avtorch.paper import Leaders, Platoon, platoon
-        >>> found: Platoon = platoon(Leaders.read(), seeds=2, seed=0)
-        >>> found.run.speed.dim(), len(found.names) == len(found.peak)
-        (4, True)
-    """
+    """`run` (setting, seed, vehicle, time), settings in the order of `names`; exact `peak` (setting,) at the truth."""
 
     ahead: Ahead
     names: tuple[str, ...]

@@ -69,12 +69,6 @@ class Regions:
     `shares`: by case and form the share of the box of gains that is stable, (1,), for the posterior (seed,). `passed`,
     `betrayed`: by case, how many gains of the box the printed conditions pass, and how many of those leave a vehicle of
     the bounds string unstable. `wider`: shares by form with wider bounds of K_L.
-
-    Example:
-        >>> from avtorch.paper import Leaders, Regions, regions
-        >>> found: Regions = regions(Leaders.read(), seeds=2, seed=0)
-        >>> len(found.shares), sorted(found.shares[0])
-        (4, ['exact', 'posterior', 'print', 'rigorous'])
     """
 
     ahead: Ahead

@@ -18,13 +18,7 @@ from avtorch.paper.rows import ClaimRow
 from avtorch.paper.strategies import strategies
 
 SEEDS = 20
-"""Noises of every setting, as the sweep asks for (SPEC section 5).
-
-Example:
-    >>> from avtorch.paper import SEEDS
-    >>> SEEDS  # noises of each setting unless others are asked for
-    20
-"""
+"""Noises of every setting, as the sweep asks for (SPEC section 5)."""
 
 
 class ExperimentResult(Protocol):
@@ -42,27 +36,14 @@ EXPERIMENTS: Mapping[str, Callable[..., ExperimentResult]] = {
     "gains": gains,
     "platoon": platoon,
 }
-"""Experiments in the order of the paper: `(leaders, seeds=, seed=, progress=)` to a result.
-
-Example:
-    >>> from avtorch.paper import EXPERIMENTS
-    >>> list(EXPERIMENTS)
-    ['regions', 'estimation', 'monitoring', 'strategies', 'gains', 'platoon']
-"""
+"""Experiments in the order of the paper: `(leaders, seeds=, seed=, progress=)` to a result."""
 
 _COST = {"regions": 8.0, "estimation": 50.0, "monitoring": 15.0, "strategies": 60.0, "gains": 5.0, "platoon": 20.0}
 
 
 @dataclass(frozen=True)
 class Reproduction:
-    """`found` by name of the experiment, in the order of the paper.
-
-    Example:
-        >>> from avtorch.paper import Reproduction, reproduce
-        >>> found: Reproduction = reproduce(["gains"], seeds=2)
-        >>> list(found.found), found.seeds
-        (['gains'], 2)
-    """
+    """`found` by name of the experiment, in the order of the paper."""
 
     found: dict[str, ExperimentResult]
     leaders: Leaders

@@ -30,14 +30,7 @@ _RESAMPLED = 1000
 
 @dataclass(frozen=True)
 class ClaimRow:
-    """`paper` and `ours` are numbers or a few words; `interval` is 90 %, None where nothing is random.
-
-    Example:
-        >>> from avtorch.paper import ClaimRow
-        >>> row = ClaimRow("monitoring", "OpenACC", "T_L [s]", 0.17, 0.03, (0.01, 0.05), "better", "0.05 < 0.17")
-        >>> row.as_dict()["interval"]
-        [0.01, 0.05]
-    """
+    """`paper` and `ours` are numbers or a few words; `interval` is 90 %, None where nothing is random."""
 
     name: str
     setting: str

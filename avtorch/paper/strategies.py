@@ -86,14 +86,7 @@ class Driven:
 
 @dataclass(frozen=True)
 class Strategies:
-    """By name, `AS_BUILT` first, then the printed ones, then ours; `seed` of the intervals.
-
-    Example:
-        >>> from avtorch.paper import Leaders, Strategies, strategies
-        >>> found: Strategies = strategies(Leaders.read(), seeds=2, seed=0)
-        >>> len(found.driven), found.seed
-        (10, 0)
-    """
+    """By name, `AS_BUILT` first, then the printed ones, then ours; `seed` of the intervals."""
 
     ahead: Ahead
     driven: dict[str, Driven]

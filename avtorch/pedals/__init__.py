@@ -15,20 +15,20 @@ Example:
 
 from avtorch.pedals.export import MapTable, accel_table, brake_table, read_map, write_map
 from avtorch.pedals.fit_map import PedalFit, fit_pedals
-from avtorch.pedals.held_out import HeldOut, crossed, held_out
+from avtorch.pedals.held_out import HeldOut
+from avtorch.pedals.pedal_command import PedalCommand
 from avtorch.pedals.pedal_map import PedalMap, PedalTable
 
 __all__ = [
     "HeldOut",
     "MapTable",
+    "PedalCommand",
     "PedalFit",
     "PedalMap",
     "PedalTable",
     "accel_table",
     "brake_table",
-    "crossed",
     "fit_pedals",
-    "held_out",
     "read_map",
     "write_map",
 ]

@@ -1,24 +1,101 @@
-"""The fit that a drive asks for: of its pedals as they were pushed, or of a commanded speed by its loop."""
+r"""The map of a drive's pedals: the force table of the diagnosis, with the lag and the dead time that follow it.
+
+    dv/dt = lag_T[K u(t - tau) + F(u(t - tau), v)] + R(v)
+
+u is what one constant each makes of the pedals, or the speed that a commanded one misses. F, R, their priors and the
+free runs that they are fitted to are those of `avtorch.gap.result.free_form`; here no named car stands beside them, and
+the dead time is fitted with them.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.signal import lfilter
 
-from avtorch.arrays import BoolArray
+from avtorch.arrays import FloatArray
+from avtorch.errors import InputError
+from avtorch.gap.effects.dead_time import DeadTime
+from avtorch.gap.engine.priors import FAINT_MAP
+from avtorch.gap.result.free_form import (
+    GAIN_SD,
+    SIZES,
+    Car,
+    Fit,
+    FreeForm,
+    LeftOut,
+    Prior,
+    Sizes,
+    best_form,
+    fitted,
+    knots_of,
+    squares_of,
+)
+from avtorch.gap.result.free_form import drive as drive_runs
+from avtorch.gap.result.output_error import Coefficients, Rows
+from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import LogSource
-from avtorch.pedals.columns import MapColumns
-from avtorch.pedals.fitting import Fitting, PedalFit
-from avtorch.pedals.loop_fitting import LoopFitting
+from avtorch.pedals.held_out import HeldOut, scored
+from avtorch.pedals.pedal_command import PedalCommand, tabulated
 from avtorch.pedals.pedal_drive import PedalDrive
+from avtorch.pedals.pedal_map import ERROR, RATE, SIGN, PedalMap, PedalTable
+
+FACTOR = Sizes(0.0, 0.0)
+"""Of the model with one constant a pedal."""
+SLOPE_SD = 0.3
+"""Standard deviation of a gain's change over one of the speed [-]: motors and gears give less where they turn fast."""
+LONGEST_S = 3.0
+"""Of the runs that teach [s]: wind and road add up over longer ones."""
+INDEPENDENT_S = 1.0
+"""Taught seconds that count as one independent error of these [s]."""
+_SETTLED_S = 0.1  # of a stretch, before a run begins: a launch is all that a drive has of full pedals
+_SIZES = tuple(size for size in SIZES if size > FAINT_MAP)  # any pedal has a map, any car a resistance
+_FIRST = Sizes(0.3, 0.3)
+_LAG = (float(np.log(0.3)), 1.0)  # mean and standard deviation of ln T_L
+_DEAD_TIMES_S = (0.0, 0.1, 0.2, 0.35, 0.5, 0.8)
+_DEAD_TIME_STEP_S = 0.02  # for its slope, and to which it is found
+
+
+@dataclass(frozen=True, eq=False)
+class PedalFit:
+    """A fitted map with what is known of its errors.
+
+    Standard errors [s] of the lag of `map`, of its dead time and of their sum, which is known far better than its
+    parts. `held_out`: how well it foretells blocks left out; `plant`: the map as a plant of the command of
+    `PedalCommand`, None of a commanded speed; `sizes`: of the table and the resistance, relative to
+    accelerations, chosen there; `seconds`: how long a drive it saw.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch import Log
+        >>> from avtorch.pedals import fit_pedals
+        >>> time = np.arange(0.0, 60.0, 0.05)
+        >>> throttle = 0.3 + 0.2 * np.sin(0.5 * time)
+        >>> speed = 15.0 + 1.2 * np.sin(0.5 * time - np.pi / 2)
+        >>> found = fit_pedals(Log.from_arrays(time=time, throttle=throttle, speed=speed))
+        >>> sorted(found.map.pedals), found.seconds > 55
+        (['throttle'], True)
+    """
+
+    map: PedalMap
+    T_L_sd: float
+    dead_time_sd: float
+    late_sd: float
+    held_out: HeldOut
+    plant: GapPlant | None
+    sizes: Sizes
+    seconds: float
 
 
 def fit_pedals(logs: LogSource | Sequence[LogSource]) -> PedalFit:
     """The map of the pedals of a drive, or of several drives of one car.
 
     Logs without pedals are fitted by their `speed_cmd`. Raises `InputError` for logs without speed or without a pedal
-    or a `speed_cmd` that moves, and for less than four blocks of five seconds that count.
+    or a `speed_cmd` that moves, and for less than three blocks of four seconds that count.
 
     Example:
         >>> import numpy as np
@@ -36,13 +113,126 @@ def fit_pedals(logs: LogSource | Sequence[LogSource]) -> PedalFit:
         >>> round(float(made.accel(np.array([8.0]), throttle=np.array([0.3]))[0]), 1), round(made.T_L, 1)
         (0.4, 0.4)
     """
-    return fit_drive(PedalDrive.of(logs))
+    drive = PedalDrive.of(logs)
+    independent = max(drive.seconds / INDEPENDENT_S, 3.0)
+    _, factor = _with_dead_time(drive, FACTOR, independent)
+    runs, edges = factor.car.runs(_LAG[0], cut=True), factor.car.edges
+    left = LeftOut.of(runs, edges) if len(runs.of_run) else None
+    if left is None:
+        raise InputError(f"logs: found {len(edges) - 1} blocks of some seconds that count, needs 3 for a map")
+    over = squares_of(Fit(factor.car, factor.x, cut=True), Prior(factor.car, FACTOR), left, independent)
+    dead_time, first = _with_dead_time(drive, _FIRST, independent)
+    _, sizes, fit = best_form(first.car, left, over, independent, _SIZES)
+    car = None if drive.is_loop else _plant_of(fit, dead_time)
+    made = _loop_map(drive, fit, dead_time) if car is None else PedalCommand.of_drive(drive).map_of(car)
+    rough = Sizes(max(sizes.resistance, _FIRST.resistance), max(sizes.table, _FIRST.table))  # smoothing is no knowledge
+    changes = _changes(drive, fit, Prior(fit.car, rough), dead_time, independent)
+    score = scored({"map": (fit, sizes), "factor": (factor, FACTOR)}, left, independent)
+    lag, late = made.T_L * changes[:, -2], changes[:, -1]
+    sds = [float(np.sqrt((x**2).sum())) for x in (lag, late, lag + late)]
+    return PedalFit(_with_errors(made, drive, fit, changes[:, :-1]), *sds, score, car, sizes, drive.seconds)
 
 
-def fit_drive(drive: PedalDrive, blocks: BoolArray | None = None, *, errors: bool = True) -> PedalFit:
-    """The map by those `blocks` (block,) of a drive that are true, by default all of them; `errors`: with standard
-    errors."""
-    used = np.ones(drive.blocks, bool) if blocks is None else blocks
-    columns = MapColumns.for_drive(drive)
-    fitting = LoopFitting if drive.is_loop else Fitting
-    return fitting(drive, columns, used).fit(errors)
+def _plant_of(fit: Fit, dead_time: float) -> GapPlant:
+    rows, x = fit.car.rows, fit.x
+    at, T_L = Coefficients.of(x[:-1], rows.shape), float(np.exp(x[-1]))
+    late = [DeadTime(dead_time)] if dead_time > 0 else []
+    forms = FreeForm(rows.knots_u, rows.knots_v, at, _FIRST, T_L).effects()
+    return plant([*late, *forms], T_L=T_L, K_L=1.0 + at.gain, sigma=0.0)
+
+
+def _loop_map(drive: PedalDrive, fit: Fit, dead_time: float) -> PedalMap:
+    """The map of a commanded speed: the table over its error, the gain on its slope."""
+    rows = fit.car.rows
+    at = Coefficients.of(fit.x[:-1], rows.shape)
+    spans = {name: (float(x.min()), float(x.max())) for name, x in drive.pedals.items()}
+    u = np.unique(np.concatenate([rows.knots_u, [0.0], spans[ERROR]]))
+    made = tabulated(
+        PedalCommand({ERROR: 1.0}, spans, (0.0, 0.0)),
+        u,
+        rows.knots_v,
+        np.stack([np.interp(u, rows.knots_u, x) for x in at.table.T], 1) + at.curve,
+        float(np.exp(fit.x[-1])),
+        dead_time,
+    )
+    if RATE not in spans:
+        return made
+    knots = np.unique([min(spans[RATE][0], 0.0), 0.0, max(spans[RATE][1], 0.0)])
+    rate = PedalTable(knots, np.outer(max(at.gain, 0.0) * knots, np.ones(len(made.speed))))
+    return replace(made, pedals={**made.pedals, RATE: rate})
+
+
+def _with_errors(made: PedalMap, drive: PedalDrive, fit: Fit, changes: FloatArray) -> PedalMap:
+    """The map with standard errors, of which `changes` (draw, coefficient) square to variances."""
+    rows = fit.car.rows
+    each = [Coefficients.of(x[:-1], rows.shape) for x in changes]
+    gains, tables = np.array([x.gain for x in each]), np.stack([x.table for x in each])
+
+    def change(u: FloatArray) -> FloatArray:  # (draw, command, speed)
+        found = np.apply_along_axis(lambda column: np.interp(u, rows.knots_u, column), 1, tables)
+        return found if drive.is_loop else found + gains[:, None, None] * u[:, None]
+
+    zero, pedals = change(np.zeros(1)), {}
+    for name, table in made.pedals.items():
+        u = SIGN[name] * drive.factors[name] * table.pedal
+        off = change(u) - zero if name != RATE else gains[:, None, None] * np.outer(u, np.ones(len(made.speed)))
+        pedals[name] = replace(table, sd=np.sqrt((off**2).sum(0)))
+    coasting = np.stack([x.curve for x in each]) + zero[:, 0]
+    return replace(made, pedals=pedals, coasting_sd=np.sqrt((coasting**2).sum(0)))
+
+
+def car_of(drive: PedalDrive, dead_time: float, knots: tuple[FloatArray, FloatArray], slope: float) -> Car:
+    """The car of one constant a pedal, with the commands of a drive as they arrive; `slope`: as `Car.slope`."""
+    u, feed = drive.late(drive.command, dead_time), drive.feed
+    closed = dead_time if drive.is_loop else None
+    late = None if feed is None else drive.late(feed, dead_time)
+    rows = Rows(drive.dt, u, drive.speed, np.arange(len(u)), drive.starts, *knots, closed, late)
+
+    def named(log_lag: float) -> FloatArray:
+        lag, out = float(np.exp(log_lag)), np.zeros(len(u))
+        if drive.is_loop:
+            return out
+        keep, ends = np.exp(-drive.dt / lag), np.append(np.flatnonzero(drive.starts), len(u))
+        for i, j in itertools.pairwise(ends):
+            after = lfilter([1 - keep], [1, -keep], u[i:j], zi=[keep * u[i]])[0]
+            out[i:j] = u[i:j] - lag / drive.dt * np.diff(np.append(u[i], after))
+        return out
+
+    car = Car(rows, named, _LAG).with_runs(LONGEST_S, _SETTLED_S)
+    car.steep, car.slope = (GAIN_SD if drive.is_loop else 0.0), slope
+    return car
+
+
+def _with_dead_time(drive: PedalDrive, sizes: Sizes, independent: float) -> tuple[float, Fit]:
+    """The dead time [s] and the fit at given sizes."""
+    knots = knots_of(drive.command, drive.speed)
+    known: dict[float, tuple[float, Fit]] = {}
+
+    def cost(dead_time: float) -> float:
+        car = car_of(drive, dead_time, knots, 0.0 if sizes == FACTOR else SLOPE_SD)
+        near = min(known, key=lambda other: abs(other - dead_time), default=None)
+        fit = fitted(car, sizes, car.zero if near is None else known[near][1].x, independent)
+        mse = max(float((fit.errors**2).mean()), 1e-8)
+        known[dead_time] = independent * np.log(mse) + Prior(car, sizes).of(fit.x), fit
+        return known[dead_time][0]
+
+    k = int(np.argmin([cost(dead_time) for dead_time in _DEAD_TIMES_S]))
+    bounds = _DEAD_TIMES_S[max(k - 1, 0)], _DEAD_TIMES_S[min(k + 1, len(_DEAD_TIMES_S) - 1)]
+    minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": _DEAD_TIME_STEP_S})
+    best = min(known, key=lambda dead_time: known[dead_time][0])
+    return best, known[best][1]
+
+
+def _changes(drive: PedalDrive, fit: Fit, prior: Prior, dead_time: float, independent: float) -> FloatArray:
+    """Changes (draw, coefficient) whose squares sum to variances, the dead time's last."""
+    rows = fit.car.rows
+    aside = car_of(drive, dead_time + _DEAD_TIME_STEP_S, (rows.knots_u, rows.knots_v), fit.car.slope)
+    by_dead_time = (drive_runs(aside, fit.x)[0] - fit.errors) / _DEAD_TIME_STEP_S
+    J = np.column_stack([fit.slopes[:, prior.moves], by_dead_time])
+    H = independent / max(float((fit.errors**2).sum()), 1e-12) * J.T @ J
+    H[:-1, :-1] += prior.precision
+    H[-1, -1] += 1.0  # 1/s²: a dead time of a second is rare
+    root = np.linalg.inv(np.linalg.cholesky(H))
+    out = np.zeros((len(root), len(prior.moves) + 1))
+    out[:, np.append(prior.moves, True)] = root
+    return out

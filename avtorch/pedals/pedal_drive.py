@@ -1,106 +1,121 @@
-"""Drives as the map is fitted to them: cells of some 50 ms without a gap, and blocks of them to hold out."""
+"""Drives as the map is fitted to them: steps of a tenth of a second without a gap, and the command of all pedals."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.optimize import nnls
 
-from avtorch.arrays import BoolArray, FloatArray, IntArray
+from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError
+from avtorch.gap.result.output_error import STEP_S
 from avtorch.io import Log, LogSource, as_logs
 from avtorch.io.mapping import PEDALS
-from avtorch.pedals.pedal_map import ERROR, RATE, inputs_of, jumps
+from avtorch.pedals.pedal_map import ERROR, RATE, SIGN, inputs_of, jumps
 
-CELL_S = 0.05
-BLOCK_S, SHORT_BLOCK_S = 10.0, 5.0
-_BLOCKS = 6  # fewer of the long ones, and a drive is cut into short ones
-_SHORTEST_S = 2.0
-_FEWEST = 4
-
-
-@dataclass(frozen=True, eq=False)
-class Piece:
-    """Cells without a gap, `dt` [s] apart: `pedals` (cell,) averaged over each, `speed` (cell + 1,) [m/s] at its
-    edges, `nominal` (cell,) [m/s²] the log's own command or None, `block` (cell,): -1 where a cell does not count.
-    They are of `rows` of the log of that number, `log`. Of a commanded speed, `speed_cmd` (cell,) [m/s], the `pedals`
-    are its error and its slope."""
-
-    dt: float
-    pedals: dict[str, FloatArray]
-    speed: FloatArray
-    nominal: FloatArray | None
-    block: IntArray
-    log: int
-    rows: slice
-    speed_cmd: FloatArray | None = None
-
-    def inputs(self, cells: IntArray, speed: FloatArray) -> dict[str, FloatArray]:
-        """What the map takes in `cells` (row,), had the car the `speed` (row,) [m/s]: a loop's error is that of it."""
-        out = {name: values[cells] for name, values in self.pedals.items()}
-        if self.speed_cmd is not None:
-            out[ERROR] = self.speed_cmd[cells] - speed
-        return out
-
-    @property
-    def cells(self) -> int:
-        return len(self.block)
-
-    @property
-    def middle(self) -> FloatArray:
-        """Speed (cell,) [m/s], not below zero."""
-        return np.maximum(0.5 * (self.speed[1:] + self.speed[:-1]), 0.0)
+_SHORTEST_S = 3.0  # of a stretch
+_SMOOTH_S = 0.1
+_SLOPE_S = 1.0  # over which accelerations are compared with pedals
+_LATE_S = (0.0, 0.1, 0.2, 0.3, 0.5, 0.8)
+_LEAST = 0.1  # of the acceleration that moves with a pedal: a driver who holds a speed shows none
 
 
 @dataclass(frozen=True, eq=False)
 class PedalDrive:
-    """All `pieces`, whose `blocks` are numbered through; `seconds` that count; `block_s`, a block's length."""
+    """Rows `dt` [s] apart: means of the `pedals` (row,) over the step that begins there, and the `speed` (row,) [m/s];
+    `starts` (row,) of stretches. Of a commanded speed the `pedals` are its error and slope.
+    """
 
-    pieces: tuple[Piece, ...]
-    blocks: int
-    seconds: float
-    block_s: float
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The pedals."""
-        return tuple(self.pieces[0].pedals)
+    dt: float
+    pedals: Mapping[str, FloatArray]
+    speed: FloatArray
+    starts: BoolArray
 
     @property
     def is_loop(self) -> bool:
         """Whether the command is a speed."""
-        return ERROR in self.names
+        return ERROR in self.pedals
 
     @property
-    def has_nominal(self) -> bool:
-        return all(piece.nominal is not None for piece in self.pieces)
-
-    def counted(self, of: str) -> FloatArray:
-        """`speed`, or a pedal by name, in all cells that count."""
-        found = [(p.middle if of == "speed" else p.pedals[of])[p.block >= 0] for p in self.pieces]
-        return np.concatenate(found)
+    def seconds(self) -> float:
+        return len(self.speed) * self.dt
 
     @classmethod
     def of(cls, logs: LogSource | Sequence[LogSource]) -> PedalDrive:
-        """Raises `InputError` for logs without pedals or a commanded speed, or without speed, and for drives too short
-        for four blocks."""
+        """Raises `InputError` for logs without pedals or a commanded speed, or without speed."""
         each = as_logs(logs)
         names = _inputs(each)
-        usable = sum(float(log.usable.sum()) / log.rate_hz for log in each)
-        length = BLOCK_S if usable >= _BLOCKS * BLOCK_S else SHORT_BLOCK_S
-        pieces: list[Piece] = []
-        blocks = 0
-        for number, log in enumerate(each):
-            for part in log.segments():
-                piece = _piece(log, number, part, names, length, blocks)
-                if piece is not None:
-                    pieces.append(piece)
-                    blocks = max(blocks, int(piece.block.max()) + 1)
-        if blocks < _FEWEST:
-            raise InputError(f"logs: found {blocks} blocks of {length:g} s that count, needs {_FEWEST} for a map")
-        seconds = sum(float((p.block >= 0).sum()) * p.dt for p in pieces)
-        return cls(tuple(pieces), blocks, seconds, length)
+        dt = max(STEP_S, *(1 / log.rate_hz for log in each)) if each else STEP_S
+        columns: dict[str, list[FloatArray]] = {name: [] for name in (*names, "speed", "starts")}
+        for log in each:
+            inputs = inputs_of(log, names)
+            for part in _stretches(log):
+                time = log.elapsed[part]
+                count = int((time[-1] - time[0]) / dt + 1e-6)
+                if count * dt < _SHORTEST_S:
+                    continue
+                assert log.speed is not None
+                edges = time[0] + dt * np.arange(count + 1)
+                smooth = gaussian_filter1d(np.interp(edges, time, log.speed[part]), _SMOOTH_S / dt)
+                columns["speed"].append(np.maximum(smooth[:-1], 0.0))
+                columns["starts"].append(np.arange(count) == 0)
+                for name in names:
+                    values = inputs[name]
+                    assert values is not None
+                    columns[name].append(_averaged(edges, time, values[part]))
+        if not columns["speed"]:
+            raise InputError(f"logs: found no stretch of {_SHORTEST_S:g} s that counts, needs some for a map")
+        whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+        return cls(dt, {name: whole[name] for name in names}, whole["speed"], whole["starts"].astype(bool))
+
+    def late(self, x: FloatArray, seconds: float) -> FloatArray:
+        """Values (row,) so much later; before a stretch they were as at its first row."""
+        at = np.arange(len(x))
+        first = np.maximum.accumulate(np.where(self.starts, at, 0))
+        whole, part = int(seconds / self.dt), seconds / self.dt - int(seconds / self.dt)
+        return (1 - part) * x[np.maximum(at - whole, first)] + part * x[np.maximum(at - whole - 1, first)]
+
+    @cached_property
+    def factors(self) -> Mapping[str, float]:
+        """What one constant each makes of the pedals [m/s² a unit]: the command beyond which there is a map."""
+        if self.is_loop:
+            return dict.fromkeys(self.pedals, 1.0)
+        width = round(_SLOPE_S / self.dt)
+        rows = np.arange(0, len(self.speed) - width, max(1, width // 4))
+        stretch = np.cumsum(self.starts)
+        rows = rows[stretch[rows] == stretch[rows + width]]
+        slope = (self.speed[rows + width] - self.speed[rows]) / (width * self.dt)
+        free = np.column_stack([np.ones(len(rows)), self.speed[rows]])
+
+        def beside(x: FloatArray) -> FloatArray:  # what no resistance explains
+            return x - free @ np.linalg.lstsq(free, x, rcond=None)[0]
+
+        best, found = np.inf, np.zeros(len(self.pedals))
+        spread = np.ones(len(self.pedals))
+        for seconds in _LATE_S:
+            means = [np.append(0.0, np.cumsum(SIGN[n] * self.late(x, seconds))) for n, x in self.pedals.items()]
+            X = np.column_stack([(m[rows + width] - m[rows]) / width for m in means])
+            x, left = nnls(beside(X), beside(slope))
+            if left < best:
+                best, found, spread = left, x, np.maximum(X.std(0), 1e-12)
+        least = _LEAST * float(slope.std()) / spread
+        return dict(zip(self.pedals, np.maximum(found, least).tolist(), strict=True))
+
+    @cached_property
+    def command(self) -> FloatArray:
+        """What the pedals ask for (row,) [m/s²] by their factors; the error of a commanded speed [m/s]."""
+        if self.is_loop:
+            return self.pedals[ERROR]
+        return np.sum([SIGN[name] * self.factors[name] * x for name, x in self.pedals.items()], axis=0)
+
+    @property
+    def feed(self) -> FloatArray | None:
+        """How fast a commanded speed moves (row,) [m/s²]; None for pedals."""
+        return self.pedals.get(RATE, np.zeros_like(self.speed)) if self.is_loop else None
 
 
 def _inputs(logs: Sequence[Log]) -> tuple[str, ...]:
@@ -124,44 +139,17 @@ def _inputs(logs: Sequence[Log]) -> tuple[str, ...]:
     return (ERROR,) if any(jumps(log) for log in logs) else (ERROR, RATE)
 
 
-def _piece(log: Log, number: int, part: slice, names: Sequence[str], length: float, first: int) -> Piece | None:
-    time = log.elapsed[part]
-    row = float(np.median(np.diff(time))) if len(time) > 1 else CELL_S
-    dt = row * max(1, round(CELL_S / row))
-    cells = int((time[-1] - time[0]) / dt + 1e-6)
-    if cells * dt < _SHORTEST_S:
-        return None
-    edges = time[0] + dt * np.arange(cells + 1)
-    assert log.speed is not None
-    inputs = inputs_of(log, names)
-    usable = np.interp(edges, time, log.usable[part].astype(float)) > 0.999
-    block = _blocks(usable[1:] & usable[:-1], length / dt, _SHORTEST_S / dt, first)
-    return Piece(
-        dt=dt,
-        pedals={name: _averaged(edges, time, values[part]) for name, values in inputs.items() if values is not None},
-        speed=np.interp(edges, time, log.speed[part]),
-        nominal=None if log.accel_cmd is None else _averaged(edges, time, log.accel_cmd[part]),
-        block=block,
-        log=number,
-        rows=part,
-        speed_cmd=_averaged(edges, time, log.speed_cmd[part]) if ERROR in names and log.speed_cmd is not None else None,
-    )
+def _stretches(log: Log) -> list[slice]:
+    """Runs of usable rows without a gap."""
+    out = []
+    for part in log.segments():
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], log.usable[part].astype(int), [0]])))
+        pairs = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+        out += [slice(part.start + a, part.start + b) for a, b in pairs if b - a > 1]
+    return out
 
 
 def _averaged(edges: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:
-    """Means (cell,) of what is held from row to row."""
+    """Means (step,) of what is held from row to row."""
     summed = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(time))])
     return np.diff(np.interp(edges, time, summed)) / np.diff(edges)
-
-
-def _blocks(counts: BoolArray, longest: float, shortest: float, first: int) -> IntArray:
-    """Runs of cells that count, each cut into equal blocks."""
-    out = np.full(len(counts), -1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], counts.astype(int), [0]])))
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
-        if b - a < shortest:
-            continue
-        number = max(1, round((b - a) / longest))
-        out[a:b] = first + np.minimum(np.arange(b - a) * number // (b - a), number - 1)
-        first += number
-    return out

@@ -17,10 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from avtorch.plots.calibration_figures import calibration_figure
-    from avtorch.plots.detectors import operating_curve, operating_figure
     from avtorch.plots.drive import diagnosis_figure
-    from avtorch.plots.gaps import gap_figure, gap_peak, gap_probability, gap_throughput
     from avtorch.plots.paper import PAPER_PICTURES, paper_pictures
     from avtorch.plots.pedals import pedal_figure, pedal_lines
     from avtorch.plots.plane import (
@@ -51,10 +48,7 @@ if TYPE_CHECKING:
     )
 
 _HOME = {
-    "calibration_figures": "calibration_figure",
-    "detectors": "operating_curve operating_figure",
     "drive": "diagnosis_figure",
-    "gaps": "gap_figure gap_peak gap_probability gap_throughput",
     "paper": "PAPER_PICTURES paper_pictures",
     "pedals": "pedal_figure pedal_lines",
     "plane": "gain_curve region region_figure setting_region stability_figure verdict_legend verdict_map",
@@ -76,7 +70,6 @@ __all__ = [
     "agreement_scatter",
     "belief_band",
     "belief_figure",
-    "calibration_figure",
     "data_quality",
     "diagnosis_figure",
     "ecdf_difference",
@@ -85,16 +78,10 @@ __all__ = [
     "events",
     "exact_density",
     "gain_curve",
-    "gap_figure",
-    "gap_peak",
-    "gap_probability",
-    "gap_throughput",
     "joint_cloud",
     "marginals",
     "motion",
     "motion_figure",
-    "operating_curve",
-    "operating_figure",
     "overview_figure",
     "paper_pictures",
     "pedal_figure",

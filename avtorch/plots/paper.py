@@ -372,13 +372,7 @@ _STRATEGIES: Mapping[str, Callable[[Strategies], Figure]] = {
 
 
 PAPER_PICTURES = (*(f"{name}.png" for name in _DRAWN), *(f"strategies_{x}.png" for x in _STRATEGIES))
-"""Every file that `paper_pictures` may name.
-
-Example:
-    >>> from avtorch.plots import PAPER_PICTURES, paper_pictures
-    >>> len(PAPER_PICTURES), paper_pictures({})  # of nothing found there is no picture
-    (8, {})
-"""
+"""Every file that `paper_pictures` may name."""
 
 
 def _windows(one: Watched, scenario: int = 0) -> list[dict[str, Any]]:

@@ -28,16 +28,6 @@ def pedal_lines(ax: Axes, made: PedalMap, pedal: str, *, lines: int = 4) -> Axes
 
     Lines are at some speeds between the slowest and the fastest that the map knows; bands are one standard error, by
     blocks of the drive, of what the pedal adds.
-
-    Example:
-        >>> import numpy as np
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.pedals import PedalMap, PedalTable
-        >>> from avtorch.plots import pedal_lines
-        >>> throttle = PedalTable(np.array([0.0, 0.1, 1.0]), np.array([[0, 0], [0, 0], [4.0, 2.0]]))
-        >>> made = PedalMap(np.array([0.0, 30.0]), np.array([0.0, -0.6]), {"throttle": throttle})
-        >>> pedal_lines(Figure().subplots(), made, "throttle").get_xlabel()
-        'throttle [%]'
     """
     table = made.pedals[pedal]
     if pedal == "brake":

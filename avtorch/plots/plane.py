@@ -43,15 +43,6 @@ def verdict_map(
     """Where a loop is string stable, where it only is locally stable and amplifies, where it is unstable; masks (y, x).
 
     Contours inside the amplifying part give the peak gain.
-
-    Example:
-        >>> import numpy as np
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.plots import verdict_map
-        >>> x = y = np.linspace(0.0, 1.0, 11)
-        >>> local, string = np.add.outer(y, x) < 1.5, np.add.outer(y, x) < 1.0
-        >>> [float(end) for end in verdict_map(Figure().subplots(), x, y, local, string).get_xlim()]
-        [0.0, 1.0]
     """
     x, y, local, string = (np.asarray(v) for v in (x, y, local, string))
     # areas and no raster: a page that loads nothing shows no image, and areas take its colours
@@ -132,14 +123,6 @@ def setting_region(
 
     The lower level's inversion is taken into account: the verdict on a vehicle is that on its effective lag and gain.
     `clouds`: draws `(T_L, K_L)` of the belief, by the name of the moment; the last one is drawn strongest.
-
-    Example:
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch import Setting
-        >>> from avtorch.plots import setting_region
-        >>> setting = Setting(time_gap=1.6).as_dict()
-        >>> setting_region(Figure().subplots(), setting, T_range=(0.1, 2.0), K_range=(0.3, 1.3), points=41).get_ylabel()
-        'actuation gain $K_L$ [-]'
     """
     T = torch.linspace(*T_range, points, dtype=torch.float64)
     K = torch.linspace(*K_range, points, dtype=torch.float64)

@@ -24,13 +24,7 @@ Place = Literal["outside upper center", "outside lower center"]
 
 
 VALIDATION_PICTURES = ("marginals.png", "joint.png", "ranks.png", "agreement.png", "ecdf.png")
-"""Every file that `validation_figures` may name.
-
-Example:
-    >>> from avtorch.plots import VALIDATION_PICTURES
-    >>> VALIDATION_PICTURES[0], len(VALIDATION_PICTURES)
-    ('marginals.png', 5)
-"""
+"""Every file that `validation_figures` may name."""
 
 
 def validation_figures(validation: Validation, *, narrow: bool = False) -> dict[str, Callable[[], Figure]]:

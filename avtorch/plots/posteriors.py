@@ -101,16 +101,6 @@ def exact_density(
 
     Args:
         tail: mass left out at either end.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.inference import integrate
-        >>> from avtorch.plots import exact_density
-        >>> from avtorch.validation import synthetic_windows
-        >>> exact = integrate(synthetic_windows(1, seed=1).density, nodes=25)
-        >>> lag, density = exact_density(exact, "T_L")
-        >>> round(float((density[:-1] * np.diff(lag)).sum()), 2)  # a density
-        1.0
     """
     i = quadrature.names.index(name)
     nodes, mass = quadrature.nodes[window, i], quadrature.mass[window, i]
@@ -140,16 +130,6 @@ def joint_cloud(
         posterior: the posterior under test, drawn as points.
         references: draws for the contours and which of their windows, by method: ``"exact"``, ``"NUTS"``.
         shown: points drawn at most, evenly taken.
-
-    Example:
-        >>> import torch
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.inference import sample
-        >>> from avtorch.plots import joint_cloud
-        >>> from avtorch.validation import synthetic_windows
-        >>> posterior = sample(synthetic_windows(1, seed=1).density, generator=torch.Generator().manual_seed(0))
-        >>> joint_cloud(Figure().subplots(), posterior).get_xlabel()
-        'actuation lag $T_L$ [s]'
     """
     cloud = _pair(posterior, names, window)
     ax.plot(*_thinned(cloud, shown).T, ".", color=BLUE, markersize=2.5, alpha=0.4, rasterized=True)
@@ -205,14 +185,6 @@ def agreement_scatter(
         error: Monte Carlo standard error of ``value``, ``(window,)``; twice its median is drawn as a bar at the left.
         converged: windows whose chains and reference both converged, ``(window,)``; the others are hollow.
         reach: half height of the axis; by default it shows nearly all windows, and at least twice the limits.
-
-    Example:
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.plots import agreement_scatter
-        >>> width, difference = [0.02, 0.05, 0.2], [0.03, -0.02, 0.3]  # of three windows
-        >>> ax = agreement_scatter(Figure().subplots(), width, difference, limits=(-0.1, 0.1))
-        >>> ax.get_title("left")
-        '67 % within'
     """
     x, y = 100 * np.asarray(width, dtype=float), np.asarray(value, dtype=float)
     middle = 0.5 * (limits[0] + limits[1])

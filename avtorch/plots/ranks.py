@@ -34,14 +34,6 @@ def pooled_rank_counts(groups: Mapping[str, ArrayLike], *, bins: int = 20) -> di
 
     Raises:
         InputError: for fewer than two groups, or an empty one.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.plots import pooled_rank_counts
-        >>> rng = np.random.default_rng(0)
-        >>> counts = pooled_rank_counts({"SGLD": rng.normal(size=100), "NUTS": rng.normal(size=100)}, bins=4)
-        >>> {name: int(np.sum(bars)) for name, bars in counts.items()}
-        {'SGLD': 100, 'NUTS': 100}
     """
     arrays = {name: np.asarray(values, dtype=float).ravel() for name, values in groups.items()}
     if len(arrays) < 2 or not all(len(a) for a in arrays.values()):
@@ -64,13 +56,6 @@ def rank_band(
     Args:
         counts: ``(bin,)`` a group.
         effective: effective sample size of a group of correlated draws; its count where it is not given.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.plots import rank_band
-        >>> low, high = rank_band({"T_L": np.full(20, 50)})["T_L"]  # 1000 ranks in 20 bins
-        >>> round(low, 1), round(high, 1)
-        (-0.4, 0.4)
     """
     # imported here, because scipy.stats takes as long as matplotlib and few figures need it
     from scipy.stats import binom
@@ -101,15 +86,6 @@ def rank_plot(
     Args:
         counts: ``(bin,)``, of ranks in equal bins, by the name of the group (:func:`pooled_rank_counts`, or SBC's).
         effective, level: see :func:`rank_band`.
-
-    Example:
-        >>> import numpy as np
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.plots import rank_plot
-        >>> counts = {"T_L": np.full(20, 50), "K_L": np.r_[np.full(10, 30), np.full(10, 70)]}  # the second is skewed
-        >>> ax = rank_plot(Figure().subplots(), counts)
-        >>> [label.get_text() for label in ax.get_yticklabels()]
-        ['T_L', 'K_L']
     """
     edges = np.linspace(0, 1, len(np.asarray(next(iter(counts.values())))) + 1)
     centres = 0.5 * (edges[1:] + edges[:-1])
@@ -148,15 +124,6 @@ def ecdf_difference(
             :func:`ecdf_of`).
         band: lower and upper bound of such an ECDF, ``(draws + 1,)`` each (`validation.uniformity.ecdf_band`).
         label: what the band is, for the legend.
-
-    Example:
-        >>> import numpy as np
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.plots import ecdf_difference
-        >>> even = np.linspace(0.01, 1.0, 100)
-        >>> ax = ecdf_difference(Figure().subplots(), {"T_L": even**1.1}, (even - 0.05, even + 0.05))
-        >>> [line.get_label() for line in ax.lines if not line.get_label().startswith("_")]
-        ['T_L']
     """
     low, high = (np.asarray(side, dtype=float) for side in band)
     x = np.arange(1, len(low) + 1) / len(low)
@@ -175,13 +142,7 @@ def ecdf_difference(
 
 
 def ecdf_of(values: ArrayLike, points: int = 100) -> FloatArray:
-    """Share of ``values`` in [0, 1] (PIT values) below ``1/points, 2/points, ..., 1``.
-
-    Example:
-        >>> from avtorch.plots import ecdf_of
-        >>> ecdf_of([0.1, 0.3, 0.35, 0.9], points=4).tolist()  # at 1/4, 2/4, 3/4 and 1
-        [0.25, 0.75, 0.75, 1.0]
-    """
+    """Share of ``values`` in [0, 1] (PIT values) below ``1/points, 2/points, ..., 1``."""
     found = np.asarray(values, dtype=float).ravel()
     binned = np.clip((found * points).astype(np.int64), 0, points - 1)
     return np.bincount(binned, minlength=points).cumsum() / len(found)

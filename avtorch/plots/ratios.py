@@ -15,16 +15,7 @@ _WIDE, _NARROW = 8.6, 4.0  # inches
 
 
 def ratio_whiskers(ax: Axes, ratios: Mapping[str, Quantity], *, narrow: bool = False) -> Axes:
-    """A dot and its central 90 % for each of `ratios`, blue where one lies outside; `narrow`: names above them.
-
-    Example:
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.gap.quantity import Quantity
-        >>> from avtorch.plots import ratio_whiskers
-        >>> ax = ratio_whiskers(Figure().subplots(), {"lag T_L [s]": Quantity(1.5, 0.1, 1.3, 1.7)})
-        >>> [label.get_text() for label in ax.get_yticklabels()]
-        ['lag T_L [s]']
-    """
+    """A dot and its central 90 % for each of `ratios`, blue where one lies outside; `narrow`: names above them."""
     for row, q in enumerate(ratios.values()):
         colour = GREY if q.q05 <= 1 <= q.q95 else BLUE
         ax.plot([q.q05, q.q95], [row, row], color=colour, linewidth=2.5)

@@ -100,15 +100,15 @@ def signature_figure() -> Figure:
     typical = [_typical(cls) for cls in EFFECTS.values()]
     effects = sorted(typical, key=lambda e: (PLACES.index(e.place), e.order, e.name))
     columns = 4
-    rows = -(-(len(effects) + 1) // columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(13, 2.1 * rows), sharex=True, sharey=True, layout="constrained")
+    rows = -(-len(effects) // columns)
+    size = (13, 2.1 * rows + 0.5)
+    figure, axes = plt.subplots(rows, columns, figsize=size, sharex=True, sharey=True, layout="constrained")
     for ax, effect in zip(axes.flat, effects, strict=False):
         effect_signature(ax, effect)
         ax.set_title(effect.place, loc="right", fontsize=8, color=GREY, fontweight="normal")
     for ax in axes.flat[len(effects) :]:
         ax.set_axis_off()
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    axes.flat[len(effects)].legend(handles, labels, loc="center left")
+    figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
     for ax in axes[:, 0]:
         ax.set_ylabel("accel. [m/s²]")
     for ax in axes.flat[max(0, len(effects) - columns) : len(effects)]:

@@ -14,7 +14,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from avtorch.deprecation import renamed
 from avtorch.io import Log
 from avtorch.io.clock import from_start, time_label
 from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, LABELS, NARROW, ORANGE, SKY, VERMILLION, legend, styled
@@ -73,16 +72,6 @@ def belief_band(
     """The belief about one parameter: 90 % interval and mean of each window, paler where the window was not used.
 
     `truth`: the true value. `bounds`: the design bounds that the controller was built for.
-
-    Example:
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch import Leader, estimate, simulate
-        >>> from avtorch.plots import belief_band
-        >>> from avtorch.results import estimates_answer
-        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
-        >>> windows = estimates_answer(estimate(log, estimator="map"))["windows"]
-        >>> belief_band(Figure().subplots(), windows, "T_L", bounds=(0.1, 0.4)).get_ylabel()
-        'actuation lag $T_L$ [s]'
     """
     if bounds is not None:
         ax.axhspan(
@@ -104,22 +93,11 @@ def belief_band(
     return _span(ax, _ends(windows))
 
 
-@renamed(until="0.3", target="required")
 def string_probability(
     ax: Axes, windows: Windows, *, required: float = 0.95, actions: Iterable[Mapping[str, Any]] = ()
 ) -> Axes:
     """P(string stable) of the setting in force, over time, as it could be known: from a window's end on (a dot, red
     below `required`), and from an action on that of the setting it chose.
-
-    Example:
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch import Leader, estimate, simulate
-        >>> from avtorch.plots import string_probability
-        >>> from avtorch.results import estimates_answer
-        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
-        >>> windows = estimates_answer(estimate(log, estimator="map"))["windows"]
-        >>> string_probability(Figure().subplots(), windows).get_ylabel()
-        'P(string stable) [-]'
     """
     ends = [(w["end_s"], w["p_string_stable"]) for w in windows]
     chosen = [(a["time_s"], a["p_string_stable"]) for a in actions if a.get("p_string_stable") is not None]
@@ -173,16 +151,6 @@ def data_quality(ax: Axes, log: Log, windows: Windows = ()) -> Axes:
     """Which rows of a log serve: recorded, masked (driver, standstill); and which windows were excited.
 
     Times are drawn from the log's start; `windows` are on its own clock, as answers have them.
-
-    Example:
-        >>> import numpy as np
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.io import Log
-        >>> from avtorch.plots import data_quality
-        >>> time = np.arange(0.0, 20.0, 0.1)
-        >>> log = Log.from_arrays(time=time, accel_cmd=np.sin(time), speed=20 - np.cos(time), engaged=time < 15)
-        >>> [label.get_text() for label in data_quality(Figure().subplots(), log).get_yticklabels()]
-        ['recorded', 'driver in charge', 'standstill', 'excited windows']
     """
     windows = from_start(windows, log.epoch_s)
     step = 1 / log.rate_hz
@@ -310,7 +278,6 @@ def belief_figure(
     return figure
 
 
-@renamed(until="0.3", target="required")
 @styled
 def probability_figure(
     windows: Windows, *, answer: Mapping[str, Any] | None = None, required: float = 0.95, narrow: bool = False
@@ -342,7 +309,6 @@ def probability_figure(
     return figure
 
 
-@renamed(until="0.3", target="required")
 @styled
 def overview_figure(
     answer: Mapping[str, Any],

@@ -103,17 +103,7 @@ class SumoType(Exported):
 
 
 def to_sumo(plant: GapPlant) -> SumoType:
-    """Lag and limits of `plant`.
-
-    Example:
-        >>> from avtorch.gap import Saturation, plant
-        >>> from avtorch.remedy import to_sumo
-        >>> exported = to_sumo(plant([Saturation(1.5, -3.0)], baseline="dead_time=0.2", T_L=0.4))
-        >>> dict(exported.values)
-        {'tauEngine': 0.4, 'accel': 1.5, 'decel': 3.0, 'emergencyDecel': 3.0}
-        >>> [text.partition(":")[0] for text in exported.lost]
-        ['tauEngine', 'dead_time']
-    """
+    """Lag and limits of `plant`."""
     limits = [x for e in plant.effects if (x := e.accel_limits()) is not None]
     most = min((high for _, high in limits), default=math.inf)
     brake = min((-low for low, _ in limits), default=math.inf)
@@ -155,19 +145,7 @@ class CarlaPedals(Exported):
 
 
 def to_carla(pedals: PedalMap, plant: GapPlant | None = None) -> CarlaPedals:
-    """The map `pedals` for throttle and brake; of the `plant`, which a diagnosis found behind them, only what is lost.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.gap import plant
-        >>> from avtorch.pedals import PedalMap, PedalTable
-        >>> from avtorch.remedy import to_carla
-        >>> throttle = PedalTable(np.array([0.0, 1.0]), np.array([[0, 0], [4.0, 2.0]]))
-        >>> made = PedalMap(np.array([0.0, 30.0]), np.array([0.0, -0.6]), {"throttle": throttle})
-        >>> told = to_carla(made, plant(baseline="dead_band=0.1"))
-        >>> list(told.tables), [text.partition(":")[0] for text in told.lost]
-        (['throttle'], ['lag 0.3 s and dead time 0 s', 'brake', 'physics', 'dead_band'])
-    """
+    """The map `pedals` for throttle and brake; of the `plant`, if one was found behind them, only what is lost."""
     given = {"throttle": accel_table(pedals), "brake": brake_table(pedals)}
     tables = {name: table for name, table in given.items() if table is not None}
     lag, late = (pedals.T_L, pedals.dead_time) if plant is None else (float(plant.T_L), delay_of(plant))
@@ -266,12 +244,6 @@ def write_exports(plant: GapPlant | None, folder: str | PathLike[str], *, pedals
     Without a `plant` there is none but CARLA's, without a map of `pedals` all but CARLA's.
 
     Raises `InputError` where the folder cannot be written.
-
-    Example:
-        >>> from avtorch.gap import plant
-        >>> from avtorch.remedy import write_exports
-        >>> [path.name for path in write_exports(plant(baseline="dead_time=0.2"), "out")]
-        ['plant.autoware.yaml', 'plant.openpilot.yaml', 'plant.sumo.xml']
     """
     made = [None] * 3 if plant is None else [to_autoware(plant), to_openpilot(plant), to_sumo(plant)]
     exports = [*made, None if pedals is None else to_carla(pedals, plant)]

@@ -45,15 +45,6 @@ class WhatToSet(Displayed):
     so its string gain was off by `peak_now - peak_assumed`. `sufficient`: `p_then` reaches `required`. `clipped`: share
     of the log's commands that `set` would have clipped. `strategies` out of 1 (lower level), 2 (time gap), 3 (gains), 4
     (feed-forward). `why`: one sentence. `notes`: what holds for steps of one size only.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.gap import plant
-        >>> from avtorch.remedy import what_to_set
-        >>> belief = {"T_L": np.full(20, 1.5), "K_L": np.full(20, 0.5)}
-        >>> answer = what_to_set(plant(T_L=1.5, K_L=0.5), belief)
-        >>> answer.sufficient, answer.p_now, answer.p_then >= answer.required
-        (True, 0.0, True)
     """
 
     in_force: Setting = field(repr=False)
@@ -123,16 +114,6 @@ def what_to_set(
     counted. Default setting in force: time gap 1 s, the paper's gains, the lower level passing through. `grid`: what is
     on offer. Limits [m/s²]. `link_delay` [s]: age of the leader's acceleration, where a setting feeds it forward.
     Raises `InputError` for a probability or speeds out of range.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.decision import Grid
-        >>> from avtorch.gap import plant
-        >>> from avtorch.remedy import what_to_set
-        >>> belief = {"T_L": np.linspace(1.4, 1.6, 20), "K_L": np.full(20, 0.5)}
-        >>> answer = what_to_set(plant(T_L=1.5, K_L=0.5), belief, grid=Grid(allowed=frozenset({2})))
-        >>> answer.strategies, answer.set.time_gap.tolist()  # the time gap alone may be changed
-        ((2,), [2.5])
     """
     if not 0.0 < required < 1.0:
         raise InputError(f"required: found {required}, needs a number between 0 and 1")

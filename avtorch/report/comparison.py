@@ -39,15 +39,7 @@ _ONE_DRIVE = {
 def comparison_html(
     found: Comparison | SimulatorComparison, *, notes: Sequence[str] = (), origin: Origin | None = None
 ) -> str:
-    """The page of a comparison as text; `notes`: on the data.
-
-    Example:
-        >>> from avtorch import GLVDPlant, Leader, compare, simulate
-        >>> from avtorch.report import comparison_html
-        >>> drives = [simulate(Leader.default(start=30.0, duration=60.0, dt=0.1), seeds=[s]).log() for s in (0, 1)]
-        >>> "No change of T_L and K_L is detected" in comparison_html(compare(*drives))
-        True
-    """
+    """The page of a comparison as text; `notes`: on the data."""
     from avtorch.gap.result.comparison import Comparison
 
     page = _of_drives(found, notes) if isinstance(found, Comparison) else _of_simulators(found, notes)
@@ -61,15 +53,7 @@ def write_comparison_page(
     notes: Sequence[str] = (),
     origin: Origin | None = None,
 ) -> Path:
-    """Write `comparison.html` into `folder`; returns its path. Raises `InputError` where it cannot be written.
-
-    Example:
-        >>> from avtorch import GLVDPlant, Leader, compare, simulate
-        >>> from avtorch.report import write_comparison_page
-        >>> drives = [simulate(Leader.default(start=30.0, duration=60.0, dt=0.1), seeds=[s]).log() for s in (0, 1)]
-        >>> write_comparison_page(compare(*drives), "out").name
-        'comparison.html'
-    """
+    """Write `comparison.html` into `folder`; returns its path. Raises `InputError` where it cannot be written."""
     return written(comparison_html(found, notes=notes, origin=origin), folder, "comparison.html")
 
 

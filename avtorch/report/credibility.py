@@ -50,18 +50,7 @@ _HEADINGS = (
 
 
 def credibility_page(found: Diagnosis, *, quality: Iterable[str] = ()) -> Page:
-    """The page. `quality`: notes from reading the data, one line each.
-
-    Example:
-        >>> from avtorch import Leader, diagnose, simulate
-        >>> from avtorch.gap import DeadTime, plant
-        >>> from avtorch.report import credibility_page
-        >>> late = plant([DeadTime(0.4)], sigma=0.0)
-        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
-        >>> page = credibility_page(diagnose(log, effects=["dead_time"], pairs=False))
-        >>> [section.title for section in page.sections][:3]
-        ['Scope of validity', 'Data used and held out', 'Assumptions']
-    """
+    """The page. `quality`: notes from reading the data, one line each."""
     log, held = found.log, found.shrinkage
     sections = (
         _scope(found),

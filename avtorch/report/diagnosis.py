@@ -68,16 +68,6 @@ def report_html(
 
     `quality`: notes from reading the data, one line each. `experiment`: what to drive next, for its picture.
     `sections`: further lines after the verdict, by title. `origin`: how the answer was made, for the footer.
-
-    Example:
-        >>> from avtorch import Leader, diagnose, simulate
-        >>> from avtorch.gap import DeadTime, plant
-        >>> from avtorch.report import report_html
-        >>> late = plant([DeadTime(0.4)], sigma=0.0)
-        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
-        >>> page = report_html(diagnose(log, effects=["dead_time"], pairs=False))
-        >>> "dead_time" in page, page.rstrip().endswith("</html>")
-        (True, True)
     """
     log, odd = found.log, found.winner.implausible
     tones: dict[str, Tone] = {"unknown": "amber", "none": "green"}

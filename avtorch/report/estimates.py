@@ -31,14 +31,6 @@ def estimates_html(
     """The page of the estimate `found` on `log`, as text; `notes`: on the data, beside those of its check.
 
     Raises `InputError` where no window was estimated.
-
-    Example:
-        >>> from avtorch import Leader, estimate, simulate
-        >>> from avtorch.report import estimates_html
-        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
-        >>> page = estimates_html(estimate(log, estimator="map"), log)
-        >>> "P(string stable)" in page, page.rstrip().endswith("</html>")
-        (True, True)
     """
     answer = estimates_answer(found)
     epoch_s = answer["epoch_s"]
@@ -73,15 +65,7 @@ def write_estimates_page(
     origin: Origin | None = None,
     name: str | None = None,
 ) -> Path:
-    """Write `estimates.html` into `folder`; returns its path. Raises `InputError` where it cannot be written.
-
-    Example:
-        >>> from avtorch import Leader, estimate, simulate
-        >>> from avtorch.report import write_estimates_page
-        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
-        >>> write_estimates_page(estimate(log, estimator="map"), log, "out").name
-        'estimates.html'
-    """
+    """Write `estimates.html` into `folder`; returns its path. Raises `InputError` where it cannot be written."""
     return written(estimates_html(found, log, notes=notes, origin=origin, name=name), folder, "estimates.html")
 
 

@@ -55,15 +55,6 @@ def fleet_html(answer: Answer, *, origin: Origin | None = None) -> str:
 
     The first 200 cars are plain HTML; all of them are found, sorted and shown by a script within the page. Links to
     reports are relative: the page belongs into the folder of the fleet. Raises `InputError` for another object.
-
-    Example:
-        >>> from avtorch.report import fleet_html
-        >>> car = {"rank": 1, "car": "red", "reason": "sound", "p_string_stable": {"now": 0.99, "lowest": 0.97}}
-        >>> car |= dict.fromkeys(("T_L", "K_L", "change", "siblings", "gap")) | {"logs": []}
-        >>> answer = {"schema": "avtorch.fleet/1", "target": 0.9, "logs": 1, "failed_logs": 0, "cars": [car]}
-        >>> answer |= {"notes": [], "reasons": {"sound": 1}, "population": None, "causes": [], "steps": ["estimate"]}
-        >>> "No car is below the target" in fleet_html(answer)
-        True
     """
     if answer.get("schema") != SCHEMA or "population" not in answer:
         raise InputError(f"answer: found {quoted(str(answer.get('schema')))}, needs the object of a fleet.json")

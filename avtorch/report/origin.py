@@ -19,11 +19,6 @@ from avtorch.version import __version__
 class Origin:
     """`command`: the exact line that made the answer, None where it was no command. `files`: SHA-256 [64 hex digits] of
     each file that was read, by its name without its folder. `settings`: the same over the settings in force.
-
-    Example:
-        >>> from avtorch.report import Origin
-        >>> Origin("avtorch diagnose lap.csv --out out").files
-        {}
     """
 
     command: str | None = None

@@ -59,18 +59,6 @@ def run_html(
     """The page of a run as text; arguments as of `avtorch.plots.overview_figure`.
 
     `truth`: T_L [s] and K_L of the vehicle, the last of each from the change on.
-
-    Example:
-        >>> from avtorch import Leader, estimate, simulate
-        >>> from avtorch.report import run_html
-        >>> from avtorch.results import estimates_answer
-        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
-        >>> change = {"time_s": 2.0, "T_L": 0.3, "K_L": 1.0}
-        >>> answer = {**estimates_answer(estimate(log, estimator="map")), "alerts": [], "actions": []}
-        >>> answer |= {"change": change, "performance": {"without_action": {}, "with_action": {}}}
-        >>> page = run_html(answer, log.elapsed, {"accel": {"leader": log.lead_accel, "with action": log.accel}})
-        >>> "No alert was raised" in page
-        True
     """
     overview = picture_of(
         "overview",
@@ -117,17 +105,6 @@ def write_run_page(answer: Mapping[str, Any], *args: Any, folder: str | PathLike
     """Write `run.html` into `folder`; returns its path. Raises `InputError` where it cannot be written.
 
     The other arguments are those of `run_html`.
-
-    Example:
-        >>> from avtorch import Leader, estimate, simulate
-        >>> from avtorch.report import write_run_page
-        >>> from avtorch.results import estimates_answer
-        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
-        >>> change = {"time_s": 2.0, "T_L": 0.3, "K_L": 1.0}
-        >>> answer = {**estimates_answer(estimate(log, estimator="map")), "alerts": [], "actions": []}
-        >>> answer |= {"change": change, "performance": {"without_action": {}, "with_action": {}}}
-        >>> write_run_page(answer, log.elapsed, {"accel": {"leader": log.lead_accel}}, folder="out").name
-        'run.html'
     """
     return written(run_html(answer, *args, **more), folder, "run.html")
 

@@ -43,16 +43,7 @@ _SAYS = {
 
 
 def validation_html(found: Validation, *, origin: Origin | None = None) -> str:
-    """The page of a validation as text. Its clouds of draws are images within the page.
-
-    Example:
-        >>> from avtorch.inference import SamplerSettings
-        >>> from avtorch.report import validation_html
-        >>> from avtorch.validation import NutsSettings, synthetic_windows, validate
-        >>> quick = dict(settings=SamplerSettings(chains=64), nuts=NutsSettings(1, 20, 10), nuts_windows=1)
-        >>> "SGLD and exact quadrature" in validation_html(validate(synthetic_windows(1, seed=1), **quick))
-        True
-    """
+    """The page of a validation as text. Its clouds of draws are images within the page."""
     answer = validation_answer(found)
     summary = answer["summary"]
     against = _REFERENCES[answer["reference"]]
@@ -73,16 +64,7 @@ def validation_html(found: Validation, *, origin: Origin | None = None) -> str:
 
 
 def write_validation_page(found: Validation, folder: str | PathLike[str], *, origin: Origin | None = None) -> Path:
-    """Write `validation.html` into `folder`; returns its path. Raises `InputError` where it cannot be written.
-
-    Example:
-        >>> from avtorch.inference import SamplerSettings
-        >>> from avtorch.report import write_validation_page
-        >>> from avtorch.validation import NutsSettings, synthetic_windows, validate
-        >>> quick = dict(settings=SamplerSettings(chains=64), nuts=NutsSettings(1, 20, 10), nuts_windows=1)
-        >>> write_validation_page(validate(synthetic_windows(1, seed=1), **quick), "out").name
-        'validation.html'
-    """
+    """Write `validation.html` into `folder`; returns its path. Raises `InputError` where it cannot be written."""
     return written(validation_html(found, origin=origin), folder, "validation.html")
 
 

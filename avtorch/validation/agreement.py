@@ -47,16 +47,6 @@ class Agreement:
         z_mean, z_sd: differences of mean and of SD over their Monte Carlo standard errors.
         rhat: rank-normalised split R-hat, over superchains (see `avtorch.validation.diagnostics`).
         ess_bulk, ess_tail: effective sample sizes for the bulk and for the 5 % and 95 % quantiles.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import sample
-        >>> from avtorch.validation import between, synthetic_windows
-        >>> density = synthetic_windows(1, seed=1).density
-        >>> one, two = (sample(density, generator=torch.Generator().manual_seed(s)) for s in (0, 1))
-        >>> found = between(one, two)
-        >>> tuple(found.sd_ratio.shape), bool((found.rhat < 1.05).all()), bool((found.w1 < 0.1).all())
-        ((1, 3), True, True)
     """
 
     names: tuple[str, ...]
@@ -208,13 +198,6 @@ class AgreementVerdict:
         share_if_exact: the share that exact draws of the same effective number would be expected to reach.
         nuts_p: p-value of the chi^2 test of NUTS's means against quadrature, or None where there is no quadrature.
         why: a plain sentence.
-
-    Example:
-        >>> from avtorch.validation import AgreementVerdict
-        >>> why = "98 of 100 windows agree"
-        >>> verdict = AgreementVerdict(True, share=0.98, low=0.93, high=1.0, share_if_exact=0.97, nuts_p=0.4, why=why)
-        >>> verdict.agree, verdict.low <= verdict.share <= verdict.high
-        (True, True)
     """
 
     agree: bool

@@ -123,12 +123,6 @@ def windows_from_prior(count: int, *, seed: int = 0, prior: Prior | None = None)
 
     Raises:
         InputError: for ``count`` below 1.
-
-    Example:
-        >>> from avtorch.validation import windows_from_prior
-        >>> windows = windows_from_prior(1000, seed=0)
-        >>> round(windows.truth[:, 0].median().item(), 1), windows.names[0]  # the prior's median lag of 0.3 s
-        (0.3, 'T_L')
     """
     generator = _generator(count, seed)
     prior = Joint(default_actuation_prior(), default_jerk_noise_prior()) if prior is None else prior
@@ -148,14 +142,6 @@ def windows_of_log(log: Log, *, window: float = 2.0, count: int | None = None) -
     Raises:
         InputError: for a log without accel_cmd or without a usable window, a ``window`` that is not positive, or
             ``count`` below 1.
-
-    Example:
-        >>> from avtorch import Leader, simulate
-        >>> from avtorch.validation import windows_of_log
-        >>> log = simulate(Leader.default(start=50.0, duration=6.0, dt=0.02)).log()
-        >>> windows = windows_of_log(log, window=2.0)
-        >>> windows.form, windows.end_s.tolist()
-        ('jerk', [2.0, 4.0, 6.0])
     """
     if log.accel_cmd is None:
         raise no_command(log, "; T_L and K_L need the demanded acceleration")

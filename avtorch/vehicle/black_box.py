@@ -39,12 +39,6 @@ class Linearised:
     `gains` (k_s [1/s²], k_v [1/s], k_a [-]), `time_gap` [s] and `feedforward` [-] as a `LinearController`'s.
     `bend` [-]: how much the slopes over a step ten times as large differ from these, as a share of the largest; near
     0 for a smooth law, large at a kink or a step of a table, where small motions have no one law.
-
-    Example:
-        >>> from avtorch.vehicle import LinearController, linearise
-        >>> law = linearise(LinearController(time_gap=1.6), speed=25.0)
-        >>> [round(k, 3) for k in law.gains], round(law.time_gap, 3), round(law.spacing, 2)
-        ([1.5, 1.5, -0.8], 1.6, 45.0)
     """
 
     speed: float

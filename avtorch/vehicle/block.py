@@ -33,14 +33,6 @@ class Block(Displayed):
     level's output, `accel_cmd` the lower level's after clipping, `clipped` where it is at the limits. `accel` is
     kinematic (0 while standing), `jerk` the instantaneous jerk of that row with its own noise (0 while standing, NaN
     where the plant does not give it). SI units.
-
-    Example:
-        >>> from avtorch.vehicle import Block, ClosedLoop, Leader
-        >>> loop = ClosedLoop(Leader.constant(speed=20.0, duration=3.0))
-        >>> whole = Block.concatenate([loop.advance(100), loop.advance(100)])
-        >>> tuple(whole.speed.shape), tuple(whole[:100].speed.shape)
-        ((1, 200), (1, 100))
-        >>> log = whole.log()  # as the car would have recorded it
     """
 
     time: Float[Tensor, " time"]
@@ -124,12 +116,4 @@ class Block(Displayed):
 
 
 class Trajectory(Block):
-    """A whole run of `simulate`: a `Block` with dimensions (scenario, vehicle, time); vehicle 0 follows the leader.
-
-    Example:
-        >>> from avtorch.vehicle import Leader, simulate
-        >>> run = simulate(Leader.constant(speed=20.0, duration=3.0), vehicles=4, scenarios=2)
-        >>> tuple(run.spacing.shape), run.collided.any().item()
-        ((2, 4, 300), False)
-        >>> log = run.log(scenario=1, vehicle=3)  # what the last car would have recorded
-    """
+    """A whole run of `simulate`: a `Block` with dimensions (scenario, vehicle, time); vehicle 0 follows the leader."""

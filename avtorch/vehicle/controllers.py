@@ -28,11 +28,6 @@ RAMP_RATE = 0.1
 
 With the nominal controller 0.1 costs a peak braking of 1.2 m/s² at 30 m/s: below the 2 m/s² that count as comfortable,
 with room for a slower actuator. 1 to 2.5 s then takes 15 s.
-
-Example:
-    >>> from avtorch.vehicle import RAMP_RATE, TimeGap
-    >>> round(0.6 / RAMP_RATE, 1), round(TimeGap(target=1.6, start=1.0).done_at, 1)  # 0.6 s more take 6 s
-    (6.0, 6.0)
 """
 
 
@@ -42,12 +37,6 @@ class TimeGap:
 
     Before `since` the gap is `start` (a driver who complies later: `since` in the future). Raises `InputError` for
     gaps < 0 or `rate <= 0`.
-
-    Example:
-        >>> from avtorch.vehicle import TimeGap
-        >>> gap = TimeGap(target=1.6, start=1.0, since=10.0)
-        >>> [float(gap.at(t).round(decimals=3)) for t in (9.0, 12.0, 20.0)]
-        [1.0, 1.2, 1.6]
     """
 
     target: Number
@@ -82,13 +71,7 @@ class TimeGap:
 
 
 NOMINAL_GAINS = (1.5, 1.5, -0.8)
-"""Gains (k_s [1/s²], k_v [1/s], k_a [-]) of the upper level by default (Table 1 of the paper).
-
-Example:
-    >>> from avtorch.vehicle import NOMINAL_GAINS, stability
-    >>> bool(stability.string_stable(T_L=0.3, K_L=1.0, time_gap=1.0, gains=NOMINAL_GAINS))
-    True
-"""
+"""Gains (k_s [1/s²], k_v [1/s], k_a [-]) of the upper level by default (Table 1 of the paper)."""
 
 
 class FollowerState(NamedTuple):
@@ -115,16 +98,7 @@ class FollowerState(NamedTuple):
 
 
 Controller = Callable[[FollowerState], Tensor]
-"""Takes a follower's state, returns the demanded acceleration [m/s²].
-
-Example:
-    >>> from avtorch.vehicle import Controller, FollowerState, Leader, simulate
-    >>> def bang_bang(state: FollowerState):
-    ...     return 2.0 * (state.spacing - 1.5 * state.speed - 5).sign()
-    >>> run = simulate(Leader.constant(speed=20.0, duration=5.0), bang_bang)
-    >>> float(run.demanded.abs().max())
-    2.0
-"""
+"""Takes a follower's state, returns the demanded acceleration [m/s²]."""
 
 
 @dataclass(frozen=True)

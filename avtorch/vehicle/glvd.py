@@ -56,13 +56,7 @@ def _check_dt(dt: Number) -> None:
 
 
 def glvd_jerk(a: Batched, u: Batched, T_L: Batched, K_L: Batched) -> Float[Tensor, "*batch"]:
-    """Noise-free jerk `(K_L u - a) / T_L` [m/s³] (Eq. 1); all arguments broadcast.
-
-    Example:
-        >>> from avtorch.vehicle import glvd_jerk
-        >>> float(glvd_jerk(a=0.5, u=2.0, T_L=0.3, K_L=0.8).round(decimals=3))
-        3.667
-    """
+    """Noise-free jerk `(K_L u - a) / T_L` [m/s³] (Eq. 1); all arguments broadcast."""
     a, u, lag, gain = _with_dtype(a, u, T_L, K_L)
     return (gain * u - a) / lag
 
@@ -98,14 +92,6 @@ def glvd_rollout(
     where alpha is 0 or negative (Euler) or underflows.
 
     Raises `InputError` for an unknown `method`, a `dt` that is no positive number, or a `u` without time dimension.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.vehicle import glvd_rollout
-        >>> step_command = torch.ones(150, dtype=torch.float64)
-        >>> a = glvd_rollout(0.0, step_command, T_L=torch.tensor([0.3, 1.5]), K_L=1.0, dt=0.01)
-        >>> tuple(a.shape), a[:, -1].round(decimals=3).tolist()  # after one lag of 1.5 s: 1 - 1/e
-        ((2, 150), [0.993, 0.632])
     """
     _check_dt(dt)
     a0, u, lag, gain = _with_dtype(a0, u, T_L, K_L)

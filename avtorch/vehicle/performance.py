@@ -40,15 +40,6 @@ class Performance:
     - `comfort_share`: rows within 2 m/s² and 2.5 m/s³. `energy_jpkgm`: positive traction work per kg and metre driven
       (acceleration, rolling, air; no recuperation). `throughput_vph`: vehicles an hour at equilibrium at the mean speed
       of the leader, NaN without a time gap.
-
-    Example:
-        >>> from avtorch.vehicle import Leader, performance, simulate
-        >>> run = simulate(Leader.default(start=180.0, duration=30.0, dt=0.05), vehicles=3)
-        >>> measures = performance(run, time_gap=1.0)
-        >>> measures.row(0, 2)["clipped_share"]  # of scenario 0, the last of three vehicles
-        0.0
-        >>> bool((measures.min_spacing_m > 0).all())
-        True
     """
 
     speed_rms_ratio: Float[Tensor, "*scenario"]
@@ -117,12 +108,6 @@ def equilibrium_throughput(
     """Vehicles an hour past a point when all drive at `speed` [m/s] and `time_gap` [s]; arguments broadcast.
 
     `3600 v / (time_gap v + standstill + length)`. Raises `InputError` for negative values.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.vehicle import equilibrium_throughput
-        >>> equilibrium_throughput(speed=25.0, time_gap=torch.tensor([1.0, 1.6, 2.5])).round().tolist()
-        [2609.0, 1818.0, 1250.0]
     """
     v, gap = checked("speed", speed, unit="m/s", least=0.0), checked("time_gap", time_gap, unit="s", least=0.0)
     return 3600 * v / (gap * v + tensor(standstill) + length)

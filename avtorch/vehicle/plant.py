@@ -24,18 +24,7 @@ Motion = tuple[Tensor, Tensor, Tensor]
 
 
 class Plant(Protocol):
-    """The interface that the loop needs of a plant.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.vehicle import Leader, Plant, simulate
-        >>> class Ideal:
-        ...     def step(self, a, v, u, dt, eps):
-        ...         return u, v + dt * u, dt * v + dt * dt / 2 * u
-        >>> run = simulate(Leader.constant(speed=20.0, duration=2.0), plant=Ideal())
-        >>> tuple(run.accel.shape)
-        (1, 1, 200)
-    """
+    """The interface that the loop needs of a plant."""
 
     def step(
         self,

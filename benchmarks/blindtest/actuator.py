@@ -45,7 +45,9 @@ def _paths(car: Car, effects: Parameters, start: float, shape: list[Factor], lag
     """The general actuator: two paths, or one second-order servo, with a rate limit."""
     brake = effects.get("brake_throttle_asymmetry", {})
     brake_gain, brake_lag = brake.get("brake_gain_ratio", 1.0), brake.get("brake_lag_ratio", 1.0)
-    bound = effects.get("rate_limit", {}).get("jerk_max_mps3", math.inf) * STEP_S
+    limit = effects.get("rate_limit", {})
+    rise = limit.get("jerk_max_mps3", math.inf) * STEP_S
+    fall = rise * limit.get("fall_ratio", 1.0)
     servo = effects.get("second_order_actuator")
     engine, pads, rate = max(start, 0.0), min(start, 0.0), 0.0
 
@@ -65,8 +67,8 @@ def _paths(car: Car, effects: Parameters, start: float, shape: list[Factor], lag
             now = engine + pads
             new, rate = _servo(now, rate, target, servo, STEP_S / (stretch * slow))
             change = new - now
-            if abs(change) > bound:
-                change = math.copysign(bound, change)
+            if not -fall <= change <= rise:
+                change = rise if change > 0 else -fall
                 rate = change / STEP_S * stretch * slow
             engine, pads = now + change, 0.0
             return engine
@@ -74,9 +76,9 @@ def _paths(car: Car, effects: Parameters, start: float, shape: list[Factor], lag
         late = quick if slow == 1.0 else -math.expm1(-STEP_S / (car.T_L * stretch * slow))
         up = quick * (max(target, 0.0) - engine)
         down = late * (min(target, 0.0) - pads)
-        if abs(up + down) > bound:
+        if not -fall <= up + down <= rise:
             # the rate limit applies to the sum of both paths; their states are reset to match the limited sum
-            now = engine + pads + math.copysign(bound, up + down)
+            now = engine + pads + (rise if up + down > 0 else -fall)
             engine, pads = max(now, 0.0), min(now, 0.0)
             return now
         engine += up
@@ -111,6 +113,20 @@ def _map(speed: float, middle: float) -> float:
     """Position in speed on a torque map: (v - v̄)/v̄ near v̄, slightly flatter far from it, as in real maps."""
     z = (speed - middle) / middle
     return z / math.sqrt(1 + 0.15 * z * z)
+
+
+def _hand_over(p: Mapping[str, float]) -> Factor:
+    """Engine and brake take turns, and neither acts while the turn changes."""
+    pause, side, waits = p["pause_s"], 0.0, -math.inf
+
+    def change(target: float, speed: float, time: float) -> float:
+        nonlocal side, waits
+        if target * side < 0:
+            waits = time + pause
+        side = target or side
+        return target if time >= waits else 0.0
+
+    return change
 
 
 def _gain_change(p: Mapping[str, float]) -> Factor:
@@ -222,6 +238,7 @@ def _speed_lag(p: Mapping[str, float]) -> Factor:
 
 
 _TARGETS = {
+    "hand_over": _hand_over,
     "speed_dependent_gain": _speed_gain,
     "gain_change": _gain_change,
     "saturation": _saturation,

@@ -99,6 +99,11 @@ def _resistance(p: Mapping[str, float], rng: np.random.Generator, reach: float) 
     return lambda speed, position, time: -r * min(1.0, speed / 0.3)
 
 
+def _viscous(p: Mapping[str, float], rng: np.random.Generator, reach: float) -> Force:
+    share = p["drag_per_s"]
+    return lambda speed, position, time: -share * speed
+
+
 def _creep(p: Mapping[str, float], rng: np.random.Generator, reach: float) -> Force:
     push, ends = p["creep_mps2"], p["ends_mps"]
 
@@ -131,6 +136,7 @@ _FORCES = {
     "aerodynamic_drag": _drag,
     "road_grade": _grade,
     "constant_resistance": _resistance,
+    "viscous_drag": _viscous,
     "low_speed_creep": _creep,
     "curve_drag": _curve_drag,
     "hunting": _hunting,

@@ -1,4 +1,4 @@
-"""The causes that a case may contain: the 22 effects of the table, and families outside the table.
+"""The causes that a case may contain: the 24 effects of the table, and families outside the table.
 
 A cause is drawn for a car and a drive, all but its strength, which scales it: 1 is the middle of what cars have, 0 no
 effect, `strongest` the upper limit. Families outside the table are split permanently: those in `CALIBRATION` may serve
@@ -74,7 +74,8 @@ def _second_order(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStr
 
 
 def _rate_limit(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
-    return lambda s: {"jerk_max_mps3": 1.5 / s}
+    fall = 1.0 if rng.random() < 0.5 else float(np.exp(rng.normal(0.0, 0.5)))
+    return lambda s: {"jerk_max_mps3": 1.5 / s, "fall_ratio": fall}
 
 
 def _speed_lag(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
@@ -205,6 +206,7 @@ EFFECTS: dict[str, Family] = {
         ),
         Family("dead_band", "command", _fixed(half_width_mps2=0.12), 6.0),
         Family("backlash", "command", _fixed(half_width_mps2=0.12), 5.0),
+        Family("hand_over", "command", _fixed(pause_s=0.3), 4.0),
         Family("saturation", "actuator", _saturation, 5.0, suits=_ROUGH),
         Family("brake_throttle_asymmetry", "actuator", _asymmetry, 3.0),
         Family("second_order_actuator", "actuator", _second_order, 2.5),
@@ -215,6 +217,7 @@ EFFECTS: dict[str, Family] = {
         Family("gear_shift", "actuator", _gear_shift, 4.0, suits=_ROUGH),
         Family("driveline_oscillation", "body", _driveline, 5.0),
         Family("aerodynamic_drag", "body", _drag, 5.0),
+        Family("viscous_drag", "body", _fixed(drag_per_s=0.012), 5.0),
         Family("road_grade", "body", _grade, 3.0),
         Family("constant_resistance", "body", _fixed(resistance_mps2=0.15), 5.0),
         Family("low_speed_creep", "body", _creep, 5.0, suits=("stop_and_go",)),
@@ -225,7 +228,7 @@ EFFECTS: dict[str, Family] = {
         Family("outliers", "sensor", _outliers, 6.0, by_chance=True),
     )
 }
-"""The 22 effects of the table, by name.
+"""The 24 effects of the table, by name.
 
 Example:
     >>> from benchmarks.blindtest import EFFECTS

@@ -31,6 +31,8 @@ SAME: Mapping[str, tuple[str, float, Callable[[float, float, float], float | Non
     **{effect: size for effect, size in SIZE_OF.items() if effect not in _OTHERWISE},
     "command_hold": ("hold_fraction", 0.0, _quotient),
     "second_order_actuator": ("natural_frequency_radps", math.inf, _quotient),
+    "hand_over": ("pause_s", 0.0, _quotient),
+    "viscous_drag": ("drag_per_s", 0.0, _quotient),
     "rate_limit": ("jerk_max_mps3", math.inf, _quotient),
     "driveline_oscillation": ("amplitude", 0.0, _quotient),
 }

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 from avtorch import diagnose
 from avtorch.io import fingerprint
-from benchmarks.blindtest import Case, draw_case
+from benchmarks.blindtest import EFFECTS, Case, draw_case
 from benchmarks.golden.facts import Answer, diagnosis_facts, timed
 
 SEED = 20265001
@@ -15,6 +15,8 @@ NUMBER = 20
 MIX = {"none": 0.2, "single": 0.35, "pair": 0.15, "outside": 0.15, "several": 0.15}
 SECONDS = (60.0, 120.0, 300.0)
 """Lengths of the drives, by turns [s]."""
+DRAWN = tuple(name for name in EFFECTS if name not in ("hand_over", "viscous_drag"))
+"""Causes of the set: those of the table when it was first drawn."""
 
 
 def cases() -> Iterator[tuple[str, Callable[[], Answer]]]:
@@ -24,7 +26,8 @@ def cases() -> Iterator[tuple[str, Callable[[], Answer]]]:
 
 
 def answered(index: int, recorder: str) -> Answer:
-    case = draw_case(index, SEED, mix=MIX, seconds=SECONDS[index % len(SECONDS)], recorder=recorder)  # type: ignore[arg-type]
+    seconds = SECONDS[index % len(SECONDS)]
+    case = draw_case(index, SEED, mix=MIX, seconds=seconds, recorder=recorder, effects=DRAWN)  # type: ignore[arg-type]
     log = case.log()
     found, took = timed(lambda: diagnose(log, progress=False))
     answer = found.to_dict()

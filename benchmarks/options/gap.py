@@ -8,9 +8,10 @@ from pathlib import Path
 
 import torch
 
-from avtorch.decision import Grid, Setting, Strategist, gap_trade_off
+from avtorch.decision import Grid, Setting, Strategist
 from avtorch.decision.settings import DRIVER_TIME_GAPS
 from avtorch.vehicle import ClosedLoop, Leader, LowerLevel, performance
+from benchmarks.options.trade_off import gap_trade_off
 from benchmarks.options.watched import CHANGE_S, WORN, belief, median_and_range, watched
 
 MILD = (1.0, 0.8)
@@ -38,7 +39,8 @@ def trade_off(out: Path | None) -> None:
         print(f"shortest time gap that reaches 0.95, {name}: {curve.least_gap() or math.nan:.2f} s")
     print(f"command effort of half the lag: {float(halved.amplification()[0]):.2f}")
     if out is not None:
-        from avtorch.plots import gap_figure, save
+        from avtorch.plots import save
+        from benchmarks.options.gap_figure import gap_figure
 
         out.mkdir(parents=True, exist_ok=True)
         save(gap_figure(whole, marked=DRIVER_TIME_GAPS), out / "time-gap.png")

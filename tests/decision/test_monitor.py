@@ -122,7 +122,7 @@ def test_saved_state_resumes_to_the_bit():
 def test_rates_of_false_alarm_in_control(name, rotating_seed, draws_factor):
     """Window posteriors scatter about one truth as widely as their SDs: alarms come at the stated rate."""
     generator = torch.Generator().manual_seed(rotating_seed)
-    n, windows, rate = 3000 * draws_factor, 12, 0.02
+    n, windows, rate = 2000 * draws_factor, 10, 0.02
     monitor = Monitor(n, detectors=[name], false_alarm_rate=rate, arl=50.0)
     alarms = torch.zeros(n, dtype=torch.float64)
     for _ in range(windows):

@@ -1,6 +1,7 @@
 """The strategist: least intrusive and sufficient by brute force, and right about clipping and insufficient settings."""
 
 import time
+from functools import cache
 
 import pytest
 import torch
@@ -24,7 +25,12 @@ def belief(T, K, *, sd=0.05, draws=256, seed=0):
 
 def history(T, K, *, accel_min=-6.0, accel_max=4.0):
     """20 s of US06 with a healthy vehicle, then two with (T, K). The leader pulls away at up to 1.7 m/s²."""
-    T, K = (torch.as_tensor(x, dtype=torch.float64).reshape(-1) for x in (T, K))
+    flat = (tuple(torch.as_tensor(x, dtype=torch.float64).reshape(-1).tolist()) for x in (T, K))
+    return _history(*flat, accel_min, accel_max)
+
+
+@cache
+def _history(T, K, accel_min, accel_max):
     loop = ClosedLoop(
         Leader.default(start=5.0),
         plant=GLVDPlant(0.3, 1.0, 0.0),
@@ -32,7 +38,7 @@ def history(T, K, *, accel_min=-6.0, accel_max=4.0):
         scenarios=len(T),
     )
     before = loop.advance(2600)
-    loop.plant = GLVDPlant(T, K, 0.0)
+    loop.plant = GLVDPlant(*(torch.tensor(x, dtype=torch.float64) for x in (T, K)), 0.0)
     return History.of_blocks([before, loop.advance(200)])
 
 

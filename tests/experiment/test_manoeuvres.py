@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -113,9 +114,11 @@ CARS = {
 }
 
 
-@pytest.mark.parametrize("limits", [Limits(), Limits(accel_min=-1, accel_max=1, seconds=30), Limits(0, 3.7, -1.4, 5)])
-@pytest.mark.parametrize("car", CARS)
-def test_a_manoeuvre_as_driven_is_a_log_that_is_read(limits: Limits, car: str, tmp_path: Path, fresh_seed: int) -> None:
+LIMITS = [Limits(), Limits(accel_min=-1, accel_max=1, seconds=30), Limits(0, 3.7, -1.4, 5)]
+
+
+@pytest.mark.parametrize(("car", "limits"), list(zip(CARS, cycle(LIMITS), strict=False)))
+def test_a_manoeuvre_as_driven_is_a_log_that_is_read(car: str, limits: Limits, tmp_path: Path, fresh_seed: int) -> None:
     logs = driven(limits, CARS[car], np.random.default_rng(fresh_seed))
     assert len(logs) == 3 * len(library(limits)) > 60
     logs[0].write(tmp_path / "driven.csv")

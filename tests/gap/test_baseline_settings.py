@@ -80,7 +80,7 @@ def test_a_comparison_keeps_them() -> None:
 
 def test_what_a_baseline_lacks_is_found_where_the_compiled_plant_lacks_the_baseline() -> None:
     """A gain that changes is tried, too: its moment is in its own equation."""
-    log = log_of([SpeedDependentGain(0.3, 12.0), DeadTime(0.3)], seed=12)
+    log = log_of([SpeedDependentGain(0.3, 12.0), DeadTime(0.3)], seed=12, seconds=75.0)
     baseline = plant([SpeedDependentGain(0.3, 12.0)])
     found = diagnose(log, baseline=baseline, effects=["dead_time", "gain_change"], pairs=False)
     assert "dead_time" in found.verdict.names

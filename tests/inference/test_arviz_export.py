@@ -7,7 +7,6 @@ import torch
 
 from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, Posterior, SamplerSettings, sample
-from avtorch.inference.arviz_export import to_arviz
 from avtorch.inference.latent import NOISE_PRIOR
 from avtorch.inference.units import UNITS
 
@@ -72,10 +71,3 @@ def test_every_parameter_has_a_unit_and_strangers_none() -> None:
 def test_window_out_of_range(posterior: Posterior, window: int) -> None:
     with pytest.raises(InputError, match=f"window: {window}"):
         posterior.to_arviz(window=window)
-
-
-def test_the_function_of_old_still_works_and_says_what_to_write(posterior: Posterior) -> None:
-    with pytest.warns(DeprecationWarning, match=r"write posterior.to_arviz\(\); avtorch 0.3 no longer has it") as seen:
-        group = to_arviz(posterior, window=0).posterior
-    assert group["T_L"].dims == ("chain", "draw")
-    assert seen[0].filename == __file__

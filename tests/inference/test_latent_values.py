@@ -92,7 +92,7 @@ def test_windows_are_what_they_are_alone(fresh_seed: int) -> None:
     torch.testing.assert_close(together, torch.cat(alone, -1), rtol=1e-12, atol=1e-9)
 
 
-@pytest.mark.parametrize("jitter", [0.0, 0.3])
+@pytest.mark.parametrize("jitter", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 def test_derivatives_from_values_are_those_of_the_graph(jitter: float, fresh_seed: int) -> None:
     """Central differences ``h`` apart are off by ``h²/6`` of the third and ``h²/12`` of the fourth derivative, here of
     the order of the curvature, and by the values' round-off over ``h`` and over ``h²``."""

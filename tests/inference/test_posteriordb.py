@@ -13,7 +13,7 @@ from tests.bars import BAR
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n == "arK-arK" else []) for n in NAMES])
 def test_means_sds_and_quantiles_are_those_of_the_reference_draws(name, data_dir, rotating_seed, draws_factor):
     """5 sigma of both sets of draws, and 0.01 SDs (1 % of an SD) for the bias of the step.
 

@@ -90,5 +90,5 @@ def test_what_no_map_can_be_fitted_to(columns: dict, told: str) -> None:
 
 
 def test_a_short_drive_is_refused() -> None:
-    with pytest.raises(InputError, match="found 2 blocks of 5 s that count, needs 4 for a map"):
-        fit_pedals(drive(plain, 6, seconds=10.5))
+    with pytest.raises(InputError, match="found 2 blocks of some seconds that count, needs 3 for a map"):
+        fit_pedals(drive(plain, 6, seconds=8.0))

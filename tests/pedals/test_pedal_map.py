@@ -1,53 +1,14 @@
-"""The map itself: monotone whatever is fitted, the same in columns and in tables, refused where it turns back."""
+"""The map itself, refused where it turns back, and the one of a plant: monotone whatever its table is."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from avtorch.errors import InputError
-from avtorch.pedals import PedalMap, PedalTable
-from avtorch.pedals.columns import MapColumns
-from avtorch.pedals.pedal_drive import Piece
-from avtorch.pedals.pedal_map import SIGN
+from avtorch.gap import DeadTime, ForceTable, ResistanceCurve, plant
+from avtorch.pedals import PedalCommand, PedalMap, PedalTable, fit_pedals
 from tests.pedals.cars import drive, plain
-
-COLUMNS = MapColumns(
-    np.array([0.0, 4.0, 11.0, 30.0]),
-    {"current": np.array([-3.0, -1.0, 0.0, 2.0, 8.0]), "brake": np.array([0.0, 0.1, 1.0])},
-)
-
-
-@settings(deadline=None, max_examples=50)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_it_is_monotone_by_construction_and_columns_are_tables(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    factors = rng.exponential(1.0, COLUMNS.count) * (rng.random(COLUMNS.count) < 0.7)
-    factors[: COLUMNS.free] = rng.normal(size=COLUMNS.free)
-    made = COLUMNS.map_of(factors, None, 0.3, 0.0)
-    speed = rng.uniform(-1.0, 35.0, 60)
-    pedals = {"current": rng.uniform(-3.0, 8.0, 60), "brake": rng.uniform(0.0, 1.0, 60)}
-    more = {name: x + rng.uniform(0.0, 1.0) for name, x in pedals.items()}
-    for name, sign in SIGN.items():
-        if name in pedals:
-            gain = made.accel(speed, **(pedals | {name: more[name]})) - made.accel(speed, **pedals)
-            assert (sign * gain >= -1e-12).all()
-    edges = np.append(speed, speed[-1])
-    piece = Piece(0.05, pedals, edges, None, np.zeros(60, int), 0, slice(0, 60))
-    assert COLUMNS.of(piece) @ factors == pytest.approx(made.accel(piece.middle, **pedals), abs=1e-9)
-    at_rest = made.accel(COLUMNS.speed, current=np.zeros(4), brake=np.zeros(4))
-    assert at_rest == pytest.approx(made.coasting)
-
-
-def test_a_straight_map_has_no_curvature() -> None:
-    """Whatever is linear in the pedal and in speed costs nothing, so that is what a short drive is given."""
-    columns = COLUMNS
-    straight = [0.2 - 0.03 * columns.speed]
-    for knots in columns.pedal.values():
-        straight.append(np.outer(np.diff(knots), 1.0 + 0.1 * columns.speed).ravel())
-    assert columns.roughness() @ np.concatenate(straight) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_its_command_is_what_others_take() -> None:
@@ -81,11 +42,30 @@ def test_tables_that_are_no_map(knots: list, accel: list, told: str) -> None:
         PedalMap(np.array([0.0, 30.0]), np.zeros(2), {})
 
 
-def test_no_round_off_makes_a_map_turn_back() -> None:
-    """A saturation is a ramp of height zero; the same numbers summed in another order may differ in the last bit."""
-    rng = np.random.default_rng(0)
-    columns = MapColumns(np.array([0.0, 10.0, 20.0, 30.0]), {"throttle": np.sort(np.append(0.0, rng.uniform(0, 1, 8)))})
-    for _ in range(200):
-        factors = np.where(rng.uniform(size=columns.count) < 0.5, 0.0, rng.uniform(size=columns.count))
-        made = columns.map_of(factors, None, 0.3, 0.0)
-        assert (np.diff(made.pedals["throttle"].accel, axis=0) >= 0).all()
+COMMAND = PedalCommand({"throttle": 4.0, "brake": 8.0}, {"throttle": (0.0, 1.0), "brake": (0.0, 0.5)}, (0.0, 30.0))
+TABLE = ForceTable((-4.0, 0.0, 4.0), (0.0, 30.0), ((1.0, 0.5), (0.0, 0.1), (-1.0, -2.0)))
+DRAG = ResistanceCurve((0.0, 30.0), (-0.1, -0.5))
+
+
+def test_the_map_of_a_plant_is_what_it_does_with_held_pedals() -> None:
+    made = COMMAND.map_of(plant([DeadTime(0.2), TABLE, DRAG], T_L=0.4, K_L=0.9))
+    assert (made.T_L, made.dead_time) == (0.4, 0.2)
+    speed = np.array([30.0, 30.0, 30.0])
+    found = made.accel(speed, throttle=np.array([0.5, 0.0, 0.0]), brake=np.array([0.0, 0.0, 0.25]))
+    want = [0.9 * 2.0 + 0.5 * (0.1 - 2.0) - 0.5, 0.1 - 0.5, -0.9 * 2.0 + 0.5 * (0.5 + 0.1) - 0.5]
+    assert found == pytest.approx(want, abs=1e-6)
+
+
+def test_a_table_that_turns_back_makes_no_map_that_does() -> None:
+    steep = ForceTable((-4.0, 0.0, 2.0, 4.0), (0.0, 30.0), ((0.0, 0.0), (0.0, 0.0), (0.0, 3.0), (-4.0, -3.0)))
+    made = COMMAND.map_of(plant([steep]))
+    assert (np.diff(made.pedals["throttle"].accel, axis=0) >= 0).all()
+
+
+def test_the_map_and_the_plant_of_a_fit_are_the_same() -> None:
+    log = drive(plain, 2, seconds=60.0)
+    fit = fit_pedals(log)
+    assert fit.plant is not None
+    again = PedalCommand.of(log).map_of(fit.plant)
+    for name, table in fit.map.pedals.items():
+        assert np.array_equal(again.pedals[name].accel, table.accel)

@@ -1,10 +1,9 @@
-"""The figures of a validation and of a calibration, made of a small one."""
+"""The figures of a validation, made of a small one."""
 
 from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
@@ -13,9 +12,7 @@ from matplotlib.text import Text
 from avtorch import plots
 from avtorch.inference import Posterior, SamplerSettings, integrate
 from avtorch.validation.agreement import AgreementVerdict, agreement, between
-from avtorch.validation.calibration import RankCalibration
 from avtorch.validation.reference import exact_draws
-from avtorch.validation.stein import Stein
 from avtorch.validation.validate import Validation
 from avtorch.validation.windows import synthetic_windows
 
@@ -35,7 +32,6 @@ def validation() -> Validation:
     drawn = exact_draws(windows.density, exact, chains=2, draws=200, generator=generator)
     nuts = Posterior(drawn.names, drawn.draws[:, :, index], drawn.converged[index])
     own = Posterior(sgld.names, sgld.draws[:, :, index], sgld.converged[index])
-    nothing = torch.zeros(WINDOWS, dtype=torch.float64)
     return Validation(
         windows=windows,
         settings=SamplerSettings(),
@@ -49,7 +45,6 @@ def validation() -> Validation:
         agreement=agreement(sgld, exact),
         nuts_agreement=None,
         sgld_nuts=between(own, nuts),
-        stein=Stein(nothing, nothing, nothing, points=0),
         seconds={},
         verdict=AgreementVerdict(True, 1.0, 0.54, 1.0, 0.9, 0.5, "a test"),
     )
@@ -111,20 +106,3 @@ def test_without_quadrature_nuts_is_the_reference(validation: Validation) -> Non
     assert set(figures) == FILES - {"ecdf.png"}
     for make in figures.values():
         nothing_runs_out(make())
-
-
-def test_figure_of_a_calibration() -> None:
-    rng = np.random.default_rng(0)
-    below = torch.from_numpy(rng.random((400, 2)))
-    # posteriors of half the SD: the truth is too often near an end
-    below[:, 1] = torch.special.ndtr(2 * torch.special.ndtri(below[:, 1]))
-    found = RankCalibration(("T_L", "log_likelihood"), (100 * below).long(), 99, below, dropped=3)
-    figure = plots.calibration_figure(found, title="one window")
-    nothing_runs_out(figure)
-    assert figure.get_suptitle().startswith("one window: 400 replications, 3 dropped")
-    assert [ax.get_title("left") for ax in figure.axes[::3]] == ["$T_L$", "log likelihood"]
-    told = figure.axes[5].get_title("left")
-    covered = 100 * float(found.coverage[0.9][1])
-    assert f"90 %: {covered:.1f}" in told
-    assert covered < 70
-    assert any(line.get_marker() == "x" and np.size(line.get_xdata()) for line in figure.axes[3].lines)

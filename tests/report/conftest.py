@@ -12,6 +12,7 @@ import avtorch
 from avtorch.experiment import Experiment, Information, library
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.remedy import setting_for
+from avtorch.report import report_html
 from benchmarks.blindtest import draw_case
 from tests.report.in_chromium import PROGRAM
 
@@ -39,6 +40,11 @@ def found(ahead: Experiment) -> Diagnosis:
     told = avtorch.diagnose(log, effects=["sensor_bias", "constant_resistance"], pairs=False)
     setting = setting_for(told, log.accel_cmd)
     return replace(told, setting=None if setting is None else setting.to_dict(), next_experiment=ahead.to_dict())
+
+
+@pytest.fixture(scope="session")
+def page_text(found: Diagnosis, ahead: Experiment) -> str:
+    return report_html(found, experiment=ahead, quality=["2 rows masked"], sections={"The loop": ["It is closed."]})
 
 
 @pytest.fixture(scope="session")

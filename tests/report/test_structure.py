@@ -7,7 +7,6 @@ from itertools import pairwise
 
 import pytest
 
-from avtorch.report import report_html
 from tests.report.pages import PAGES
 from tests.report.tree import Element, read
 
@@ -28,8 +27,7 @@ def name(request: pytest.FixtureRequest) -> str:
 def text(name: str, request: pytest.FixtureRequest) -> str:
     if name != "diagnosis":
         return PAGES[name]()
-    found, ahead = (request.getfixturevalue(x) for x in ("found", "ahead"))
-    return report_html(found, experiment=ahead, quality=["2 rows masked"], sections={"The loop": ["It is closed."]})
+    return request.getfixturevalue("page_text")
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 Example:
     >>> from avtorch.gap import effects
     >>> len(effects.__all__), effects.DeadTime.place, effects.DeadTime.equation
-    (22, 'command', 'u(t - tau)')
+    (24, 'command', 'u(t - tau)')
 """
 
 from avtorch.gap.effects.aerodynamic_drag import AerodynamicDrag
@@ -17,6 +17,7 @@ from avtorch.gap.effects.driveline_oscillation import DrivelineOscillation
 from avtorch.gap.effects.gain_change import GainChange
 from avtorch.gap.effects.gear_shift import GearShift
 from avtorch.gap.effects.gust import Gust
+from avtorch.gap.effects.hand_over import HandOver
 from avtorch.gap.effects.low_speed_creep import LowSpeedCreep
 from avtorch.gap.effects.outliers import Outliers
 from avtorch.gap.effects.rate_limit import RateLimit
@@ -28,6 +29,7 @@ from avtorch.gap.effects.sensor_lag import SensorLag
 from avtorch.gap.effects.sensor_scale import SensorScale
 from avtorch.gap.effects.speed_dependent_gain import SpeedDependentGain
 from avtorch.gap.effects.speed_dependent_lag import SpeedDependentLag
+from avtorch.gap.effects.viscous_drag import ViscousDrag
 
 __all__ = [
     "AerodynamicDrag",
@@ -41,6 +43,7 @@ __all__ = [
     "GainChange",
     "GearShift",
     "Gust",
+    "HandOver",
     "LowSpeedCreep",
     "Outliers",
     "RateLimit",
@@ -52,4 +55,5 @@ __all__ = [
     "SensorScale",
     "SpeedDependentGain",
     "SpeedDependentLag",
+    "ViscousDrag",
 ]

@@ -3,9 +3,9 @@
 The chain is that of `avtorch.gap.simulator`, and so are its equations; both are held to each other by a test. A drive
 is given on a grid of steps of at most `GRID_S`, so that what a recorder delays can be read between rows:
 
-    command      saturation, dead band, play, dead time
-    actuator     tau² a'' + T a' + a = g, |a'| bounded;  g = K u times gains by sign, speed, time and gear; T likewise
-    body         ring of the driveline, drag, resistance, creep
+    command      saturation, dead band, play, pause of the hand-over, dead time
+    actuator     tau² a'' + T a' + a = g, a' bounded;  g = K u times gains by sign, speed, time and gear; T likewise
+    body         ring of the driveline, drags, resistance, creep
     sensor       first-order filter, scale, offset
 
 Each step is integrated exactly for a held target; the speed gains the actuator's integral and the forces' trapezoids.
@@ -28,16 +28,18 @@ GRID_S = 0.0252
 
 _T_L, _K_L = INDEX["T_L"], INDEX["K_L"]
 _DRIVE, _BRAKE = INDEX["drive_limit"], INDEX["brake_limit"]
-_BAND, _PLAY, _DELAY = INDEX["dead_band"], INDEX["backlash"], INDEX["dead_time"]
+_BAND, _PLAY, _PAUSE, _DELAY = (INDEX[name] for name in ("dead_band", "backlash", "hand_over", "dead_time"))
 _BRAKE_GAIN, _BRAKE_LAG = INDEX["log_brake_gain"], INDEX["log_brake_lag"]
-_SQUARE, _LAG_RATIO, _JERK = INDEX["square_period"], INDEX["log_lag_ratio"], INDEX["inverse_jerk"]
+_SQUARE, _LAG_RATIO = INDEX["square_period"], INDEX["log_lag_ratio"]
+_JERK, _FALL = INDEX["inverse_jerk"], INDEX["log_fall"]
 _LAG_SLOPE, _GAIN_SLOPE = INDEX["lag_slope"], INDEX["gain_slope"]
 _STEP, _RAMP = INDEX["gain_step"], INDEX["gain_ramp"]
 _DEPTH, _DURATION, _HYSTERESIS = INDEX["shift_depth"], INDEX["shift_duration"], INDEX["shift_hysteresis"]
 _RING_A, _RING_Q = INDEX["ring_amplitude"], INDEX["ring_quadrature"]
 _RING_F, _RING_Z = INDEX["ring_frequency"], INDEX["ring_damping"]
 _FREE, _FREE_F = INDEX["free_pole"], INDEX["free_frequency"]
-_DRAG, _WIND, _ROLL, _CREEP = INDEX["drag"], INDEX["wind"], INDEX["resistance"], INDEX["creep"]
+_DRAG, _WIND, _VISCOUS = INDEX["drag"], INDEX["wind"], INDEX["viscous"]
+_ROLL, _CREEP = INDEX["resistance"], INDEX["creep"]
 _SENSOR_LAG, _SCALE, _BIAS = INDEX["sensor_lag"], INDEX["sensor_scale"], INDEX["sensor_bias"]
 
 _LEAST_FACTOR = 0.05  # as in `effects.speed_dependent_gain`
@@ -80,9 +82,9 @@ def _risen(since: float, ramp: float) -> float:  # pragma: no cover - compiled
 def _commands(  # pragma: no cover - compiled
     p: FloatArray, acts: FloatArray, time: FloatArray, command: FloatArray, starts: BoolArray, out: FloatArray
 ) -> None:
-    """Commands behind saturation, dead band and play; `out` (grid,)."""
+    """Commands behind saturation, dead band, play and hand-over; `out` (grid,)."""
     K = p[_K_L]
-    play = 0.0
+    play, before, since = 0.0, 0.0, -1e9
     for k in range(len(time)):
         t, c = time[k], command[k]
         drive = p[_DRIVE] if t >= acts[_DRIVE] else 0.0
@@ -96,7 +98,17 @@ def _commands(  # pragma: no cover - compiled
             c = max(c - band, 0.0) + min(c + band, 0.0)
         width = p[_PLAY] if t >= acts[_PLAY] else 0.0
         play = c if starts[k] or width <= 0.0 else max(c - width, min(c + width, play))
-        out[k] = play
+        c = play
+        if starts[k]:
+            before, since = 0.0, -1e9
+        if c * before < 0.0:
+            since = t
+        if c != 0.0:
+            before = c
+        pause = p[_PAUSE] if t >= acts[_PAUSE] else 0.0
+        if pause > 0.0 and k + 1 < len(time):
+            c *= 1.0 - min(max((since + pause - t) / (time[k + 1] - t), 0.0), 1.0)
+        out[k] = c
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
@@ -138,7 +150,7 @@ def simulate(  # pragma: no cover - compiled
     ring_h = -1.0
     s_keep = s_old = s_new = s_h = s_lag = -1.0
     m_square = until = -1.0
-    jerk_limit = slower = brake_gain = brake_lag = 1.0
+    up_limit = down_limit = slower = brake_gain = brake_lag = 1.0
     for k in range(n):
         t, v = time[k], max(speed[k], 0.0)
         if k == 0 or starts[k] or t >= until:  # what acts changes at onsets alone
@@ -147,11 +159,12 @@ def simulate(  # pragma: no cover - compiled
                 q[j] = p[j] if t >= acts[j] else _NEUTRAL[j]
                 if acts[j] > t:
                     until = min(until, acts[j])
-            jerk_limit = 1.0 / q[_JERK] if q[_JERK] > 1e-9 else 1e9
+            up_limit = 1.0 / q[_JERK] if q[_JERK] > 1e-9 else 1e9
+            down_limit = up_limit * math.exp(q[_FALL])
             slower, brake_gain, brake_lag = math.exp(q[_LAG_RATIO]), math.exp(q[_BRAKE_GAIN]), math.exp(q[_BRAKE_LAG])
         # body forces at this row
         air = v + p[_WIND]
-        outer = -q[_DRAG] * air * abs(air)
+        outer = -q[_DRAG] * air * abs(air) - q[_VISCOUS] * v
         if v > 0.0:
             outer -= q[_ROLL]
         if q[_CREEP] != 0.0:
@@ -250,6 +263,7 @@ def simulate(  # pragma: no cover - compiled
             if q[_SQUARE] > 0.0:
                 if q[_JERK] > 1e-9:
                     d = target - slewed
+                    jerk_limit = up_limit if d > 0.0 else down_limit
                     moving = min(abs(d) / jerk_limit, length)
                     after = slewed + max(min(d, jerk_limit * length), -jerk_limit * length)
                     missed = moving * 0.5 * (d + target - after) + (length - moving) * (target - after)
@@ -264,6 +278,7 @@ def simulate(  # pragma: no cover - compiled
                 a, w = after, swing
             elif q[_JERK] > 1e-9:
                 d = target - a
+                jerk_limit = up_limit if d > 0.0 else down_limit
                 at_limit = min(max(abs(d) / jerk_limit - T, 0.0), length)
                 cut = math.copysign(jerk_limit * at_limit, d)
                 rest = length - at_limit

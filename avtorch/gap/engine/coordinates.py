@@ -23,10 +23,11 @@ from avtorch.gap.simulator.parameter import Parameter
 
 NAMES = (
     *("T_L", "K_L", "accel_delay", "speed_delay", "accel_filter", "speed_filter"),
-    *("dead_time", "dead_band", "backlash", "drive_limit", "brake_limit"),
-    *("log_brake_gain", "log_brake_lag", "square_period", "log_lag_ratio", "inverse_jerk"),
+    *("dead_time", "dead_band", "backlash", "hand_over", "drive_limit", "brake_limit"),
+    *("log_brake_gain", "log_brake_lag", "square_period", "log_lag_ratio", "inverse_jerk", "log_fall"),
     *("lag_slope", "gain_slope", "gain_step", "gain_ramp", "shift_depth", "shift_duration", "shift_hysteresis"),
-    *("ring_amplitude", "ring_quadrature", "ring_frequency", "ring_damping", "drag", "wind", "resistance", "creep"),
+    *("ring_amplitude", "ring_quadrature", "ring_frequency", "ring_damping", "drag", "wind", "viscous"),
+    *("resistance", "creep"),
     *("sensor_lag", "sensor_bias", "sensor_scale", "free_pole", "free_frequency"),
 )
 """Of the value vector (parameter,), in its order."""
@@ -150,8 +151,10 @@ def _sized(name: str, effect: str, parameter: str, link: Link, low: float, high:
     return Coordinate(name, parameter, link, low, high, SCALE_OF_RANGE * ends[-1], FAINT_OF_RANGE * near, sign=sign)
 
 
-def _nuisance(name: str, parameter: str, mean: float, sd: float, low: float, high: float) -> Coordinate:
-    return Coordinate(name, parameter, "value", low, high, sd, mean=mean)
+def _nuisance(
+    name: str, parameter: str, mean: float, sd: float, low: float, high: float, link: Link = "value"
+) -> Coordinate:
+    return Coordinate(name, parameter, link, low, high, sd, mean=mean)
 
 
 def _lasting(name: str, effect: str, parameter: str) -> Coordinate:
@@ -186,6 +189,9 @@ EFFECTS: dict[str, EngineEffect] = {
             "backlash", (_sized("backlash", "backlash", "half_width_mps2", "value", 0, 1.5),), ((0.05,), (0.2,), (0.5,))
         ),
         EngineEffect(
+            "hand_over", (_sized("hand_over", "hand_over", "pause_s", "value", 0, 2),), ((0.1,), (0.3,), (0.8,))
+        ),
+        EngineEffect(
             "saturation",
             (
                 _sized("drive_limit", "saturation", "accel_max_mps2", "inverse", 0, 12),
@@ -210,8 +216,11 @@ EFFECTS: dict[str, EngineEffect] = {
         ),
         EngineEffect(
             "rate_limit",
-            (_sized("inverse_jerk", "rate_limit", "jerk_max_mps3", "inverse", 0, 12),),
-            ((0.4,), (1.0,), (2.5,)),
+            (
+                _sized("inverse_jerk", "rate_limit", "jerk_max_mps3", "inverse", 0, 12),
+                _nuisance("log_fall", "fall_ratio", 0.0, 0.7, -2.5, 2.5, "log"),
+            ),
+            ((0.4, 0.0), (1.0, 0.0), (2.5, 0.0)),
         ),
         EngineEffect(
             "speed_dependent_lag",
@@ -274,6 +283,13 @@ EFFECTS: dict[str, EngineEffect] = {
                 _nuisance("wind", "wind_mps", 0.0, 3.0, -12.0, 12.0),
             ),
             ((4e-4, 0.0), (4e-4, 5.0)),
+            "may",
+            _SPEED,
+        ),
+        EngineEffect(
+            "viscous_drag",
+            (_sized("viscous", "viscous_drag", "drag_per_s", "value", 0, 2),),
+            ((0.012,),),
             "may",
             _SPEED,
         ),

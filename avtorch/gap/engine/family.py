@@ -7,8 +7,8 @@ from avtorch.gap.engine.force_map import CURVES
 FAMILIES = {
     "force map": CURVES,
     "dynamics": (
-        *("dead_time", "backlash", "second_order_actuator", "rate_limit", "speed_dependent_lag", "gear_shift"),
-        "driveline_oscillation",
+        *("dead_time", "backlash", "hand_over", "second_order_actuator", "rate_limit", "speed_dependent_lag"),
+        *("gear_shift", "driveline_oscillation"),
     ),
     "place": ("road_grade",),
     "time": ("gain_change",),

@@ -24,7 +24,7 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.priors import FAINT_MAP, MAP_SIZE
 
-RESISTANCES = ("aerodynamic_drag", "constant_resistance", "low_speed_creep")
+RESISTANCES = ("aerodynamic_drag", "viscous_drag", "constant_resistance", "low_speed_creep")
 """Effects that are a curve over the speed."""
 CURVES = (*RESISTANCES, "dead_band", "saturation", "brake_throttle_asymmetry", "speed_dependent_gain")
 """Effects that are a map, or make another map of one: beside a map they have no name of their own."""

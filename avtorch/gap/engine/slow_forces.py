@@ -276,8 +276,9 @@ def pulling_lags(h: Hypothesis) -> FloatArray:
         return np.array([lag])
     values = h.values.copy()
     values[[INDEX["accel_delay"], INDEX["accel_filter"]]] = 0.0
-    slope = np.abs(np.diff(h.rows(values)[0])) / np.diff(h.data.time)
-    limited = float((slope > AT_LIMIT / inverse_jerk).mean())
+    slope = np.diff(h.rows(values)[0]) / np.diff(h.data.time)
+    most = np.where(slope > 0, 1.0, np.exp(h["log_fall"])) / inverse_jerk
+    limited = float((np.abs(slope) > AT_LIMIT * most).mean())
     return np.asarray(lag * (1 + limited * (PULLING_LAG_RATIOS - 1)), float)
 
 

@@ -16,9 +16,10 @@ nearby proves little (Roberts et al. 2017). A run is nearly linear in b, so bloc
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -26,13 +27,14 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.signal import lfilter
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
+from avtorch.gap.answer.budget import HORIZON_S
 from avtorch.gap.engine.car import plant_of
 from avtorch.gap.engine.force_map import ForceMap
 from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.priors import MAP_SIZE
 from avtorch.gap.engine.sample import sample
-from avtorch.gap.result.output_error import STEP_S, Coefficients, Rows, Runs
+from avtorch.gap.result.output_error import SETTLED_S, STEP_S, Coefficients, Rows, Runs
 from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.force_table import ForceTable, ResistanceCurve
 from avtorch.gap.simulator.order import at_place
@@ -112,35 +114,59 @@ class FreeForm:
 
 
 # the car's runs -------------------------------------------------------------------------------------------------------
-class _Car:
-    """A hypothesis without a force map and its runs at any lag. `lag`: mean and standard deviation of ln T_L."""
+class Car:
+    """What a car without a free form does along `rows`: at ln T_L, `named` gives the mean acceleration over each step
+    (row,) [m/s²]. `lag`: mean and standard deviation of ln T_L. Of gains that the table has at any size, standard
+    deviations: `steep` [-], and `slope` [-], of their change over a standard deviation of the speed."""
 
-    def __init__(self, h: Hypothesis, baseline: GapPlant | None, lag: tuple[float, float]) -> None:
-        self.h, self.lag = h, lag
-        self.car = plant_of(h, baseline)
+    steep = 0.0
+    slope = 0.0
+    longest_s = HORIZON_S
+    settled_s = SETTLED_S
+
+    def __init__(self, rows: Rows, named: Callable[[float], FloatArray], lag: tuple[float, float]) -> None:
+        self.rows, self.named, self.lag = rows, named, lag
+        self.zero = np.append(np.zeros(rows.shape[0] * rows.shape[1] + rows.shape[1] + 1), lag[0])
+        self._known: dict[tuple[float, bool], Runs] = {}
+
+    @classmethod
+    def of(cls, h: Hypothesis, baseline: GapPlant | None, lag: tuple[float, float]) -> Self:
+        """A hypothesis without a force map."""
         data = h.data
         assert data.speed is not None
         every = max(1, round(STEP_S / data.dt))
-        rows = [np.arange(i, j, every) for i, j in itertools.pairwise(data.bounds) if (j - i) // every > 2]
-        source, dt = np.concatenate(rows), every * data.dt
-        starts = np.concatenate([np.arange(len(r)) == 0 for r in rows])
-        command, speed = self._arriving(source, dt), data.smooth_speed[source]
-        knots = _knots(command, _U_QUANTILES, zero=True), _knots(speed, _V_QUANTILES)
-        self.rows = Rows(dt, command, speed, source, starts, *knots)
-        self.zero = np.append(np.zeros(len(knots[0]) * len(knots[1]) + len(knots[1]) + 1), lag[0])
-        self._known: dict[tuple[float, bool], Runs] = {}
+        each = [np.arange(i, j, every) for i, j in itertools.pairwise(data.bounds) if (j - i) // every > 2]
+        source, dt = np.concatenate(each), every * data.dt
+        starts = np.concatenate([np.arange(len(r)) == 0 for r in each])
+        command, speed = _arriving(h, plant_of(h, baseline), source, dt), data.smooth_speed[source]
+        rows = Rows(dt, command, speed, source, starts, *knots_of(command, speed))
+
+        def named(log_lag: float) -> FloatArray:
+            other = h.copy()
+            other["T_L"] = float(np.exp(log_lag))
+            gained, time = other.on_grid()[1], data.time[source]
+            at, after = (np.interp(t, data.grid.time, gained) for t in (time, time + dt))
+            last = np.append(starts[1:], True)
+            after[last] = at[last]  # of no run
+            return (after - at) / dt
+
+        return cls(rows, named, lag)
 
     def runs(self, log_lag: float, *, cut: bool = False) -> Runs:
         """The free runs of the car with that ln T_L; `cut`: none goes beyond its block."""
         if (log_lag, cut) not in self._known:
-            h, rows = self.h.copy(), self.rows
-            h["T_L"] = float(np.exp(log_lag))
-            gained, time = h.on_grid()[1], h.data.time[rows.source]
-            at, after = (np.interp(t, h.data.grid.time, gained) for t in (time, time + rows.dt))
-            last = np.append(rows.starts[1:], True)
-            after[last] = at[last]  # of no run
-            self._known[log_lag, cut] = Runs.of(rows, (after - at) / rows.dt, self.edges if cut else None)
+            edges = self.edges if cut else None
+            self._known[log_lag, cut] = Runs.of(
+                self.rows, self.named(log_lag), edges, longest_s=self.longest_s, settled_s=self.settled_s
+            )
         return self._known[log_lag, cut]
+
+    def with_runs(self, longest_s: float, settled_s: float | None = None) -> Car:
+        """The same car with runs up to `longest_s` [s], the first one `settled_s` [s] after a stretch begins."""
+        out = Car(self.rows, self.named, self.lag)
+        out.steep, out.slope, out.longest_s = self.steep, self.slope, longest_s
+        out.settled_s = self.settled_s if settled_s is None else settled_s
+        return out
 
     @cached_property
     def edges(self) -> IntArray:
@@ -152,30 +178,36 @@ class _Car:
             out += np.linspace(i, j, max(1, round((j - i) * dt / length)) + 1).astype(int)[1:].tolist()
         return np.array(out)
 
-    def _arriving(self, source: IntArray, step: float) -> FloatArray:
-        """Commands (row,) behind the effects upstream of the actuator, as means over the steps [s] from `source` on."""
-        data, out = self.h.data, np.empty(len(source))
-        effects = [e for e in at_place(self.car.effects, "command") if not e.random]
-        late = sum(float(e.values()[e.shift]) for e in effects if e.shift is not None)
-        T_L, K_L = torch.as_tensor(self.car.T_L), torch.as_tensor(self.car.K_L)
-        row_of = np.searchsorted(source, data.bounds)
-        for (i, j), (a, b) in zip(itertools.pairwise(data.bounds), itertools.pairwise(row_of), strict=True):
-            if a == b:
-                continue
-            u, t = data.command[i:j], data.time[i:j]
-            speed, dt = torch.as_tensor(data.smooth_speed[i:j]), torch.tensor(data.dt)
-            row = EffectContext(torch.as_tensor(t), dt, speed, None, T_L, K_L)
-            for e in effects:
-                if e.shift is None:
-                    u = e.over(torch.as_tensor(u), row).numpy()
-            whole, ends = np.append(0.0, np.cumsum(u * data.dt)), np.append(t, t[-1] + data.dt)
-            begins = data.time[source[a:b]] - late
-            since, until = (
-                np.interp(x, ends, whole) + np.minimum(x - ends[0], 0.0) * u[0]
-                for x in (begins, np.minimum(begins + step, ends[-1]))
-            )
-            out[a:b] = (until - since) / step
-        return out
+
+def knots_of(command: FloatArray, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Where the table is told: knots of commands and of speeds, where they were driven."""
+    return _knots(command, _U_QUANTILES, zero=True), _knots(speed, _V_QUANTILES)
+
+
+def _arriving(h: Hypothesis, car: GapPlant, source: IntArray, step: float) -> FloatArray:
+    """Commands (row,) behind the effects upstream of the actuator, as means over the steps [s] from `source` on."""
+    data, out = h.data, np.empty(len(source))
+    effects = [e for e in at_place(car.effects, "command") if not e.random]
+    late = sum(float(e.values()[e.shift]) for e in effects if e.shift is not None)
+    T_L, K_L = torch.as_tensor(car.T_L), torch.as_tensor(car.K_L)
+    row_of = np.searchsorted(source, data.bounds)
+    for (i, j), (a, b) in zip(itertools.pairwise(data.bounds), itertools.pairwise(row_of), strict=True):
+        if a == b:
+            continue
+        u, t = data.command[i:j], data.time[i:j]
+        speed, dt = torch.as_tensor(data.smooth_speed[i:j]), torch.tensor(data.dt)
+        row = EffectContext(torch.as_tensor(t), dt, speed, None, T_L, K_L)
+        for e in effects:
+            if e.shift is None:
+                u = e.over(torch.as_tensor(u), row).numpy()
+        whole, ends = np.append(0.0, np.cumsum(u * data.dt)), np.append(t, t[-1] + data.dt)
+        begins = data.time[source[a:b]] - late
+        since, until = (
+            np.interp(x, ends, whole) + np.minimum(x - ends[0], 0.0) * u[0]
+            for x in (begins, np.minimum(begins + step, ends[-1]))
+        )
+        out[a:b] = (until - since) / step
+    return out
 
 
 def _knots(x: FloatArray, quantiles: Sequence[float], *, zero: bool = False) -> FloatArray:
@@ -197,10 +229,10 @@ def _matern(x: FloatArray) -> FloatArray:
 
 
 # the fit --------------------------------------------------------------------------------------------------------------
-class _Prior:
+class Prior:
     """Precision of the coefficients that move at given sizes: those of table and curve, the gain, and ln T_L."""
 
-    def __init__(self, car: _Car, sizes: Sizes) -> None:
+    def __init__(self, car: Car, sizes: Sizes) -> None:
         rows = car.rows
         u, v = rows.command, rows.speed
         along_u = _matern(rows.knots_u / max(float(u.std()), 1e-9))
@@ -209,11 +241,14 @@ class _Prior:
         scale = max(float(np.diff(v)[~rows.starts[1:]].std()) / rows.dt, 1e-3)
         table = np.kron(along_u, np.ones_like(along_v)) + 0.5 * np.kron(along_u, along_v)
         curve = 1.0 + np.outer(z, z) + along_v
+        always = np.kron(np.outer(rows.knots_u, rows.knots_u), car.steep**2 + car.slope**2 * np.outer(z, z))
         blocks, moves = [], []
-        for covariance, size in ((table, sizes.table), (curve, sizes.resistance)):
-            moves += [size > 0] * len(covariance)
-            if size > 0:
-                blocks.append(np.linalg.inv(covariance + _SLACK * np.eye(len(covariance))) / (size * scale) ** 2)
+        for covariance, size, free in ((table, sizes.table, always), (curve, sizes.resistance, 0 * along_v)):
+            whole = (size * scale) ** 2 * covariance + free
+            moves += [bool(whole.any())] * len(whole)
+            if moves[-1]:
+                slack = _SLACK * ((size * scale) ** 2 + car.steep**2 + car.slope**2)
+                blocks.append(np.linalg.inv(whole + slack * np.eye(len(whole))))
         blocks += [np.array([[GAIN_SD**-2]]), np.array([[car.lag[1] ** -2]])]
         self.moves = np.array([*moves, True, True])
         n = sum(len(b) for b in blocks)
@@ -234,10 +269,10 @@ _LEAST_LAG_SD = 0.02  # of its logarithm
 _LAG_STEP = 0.05  # of ln T_L, for its slope
 
 
-class _Fit:
+class Fit:
     """Coefficients `x` (table, curve, gain, ln T_L) with the errors (error,) and slopes (error, coefficient) there."""
 
-    def __init__(self, car: _Car, x: FloatArray, *, cut: bool = False) -> None:
+    def __init__(self, car: Car, x: FloatArray, *, cut: bool = False) -> None:
         self.car, self.x = car, x
         self.runs = car.runs(float(x[-1]), cut=cut)
         self.errors, slopes = drive(car, x, slopes=True, cut=cut)
@@ -247,17 +282,17 @@ class _Fit:
         self.slopes = np.column_stack([slopes, lagged])
 
 
-def drive(car: _Car, x: FloatArray, *, slopes: bool = False, cut: bool = False) -> tuple[FloatArray, FloatArray]:
+def drive(car: Car, x: FloatArray, *, slopes: bool = False, cut: bool = False) -> tuple[FloatArray, FloatArray]:
     """Errors (error,) of the runs at coefficients, and their slopes but for ln T_L."""
     runs = car.runs(float(x[-1]), cut=cut)
     return runs.drive(float(np.exp(x[-1])), Coefficients.of(x[:-1], car.rows.shape), slopes=slopes)
 
 
-def _fitted(car: _Car, sizes: Sizes, x: FloatArray, independent: float) -> _Fit:
+def fitted(car: Car, sizes: Sizes, x: FloatArray, independent: float) -> Fit:
     """Levenberg and Marquardt from `x`."""
-    prior = _Prior(car, sizes)
+    prior = Prior(car, sizes)
     m = prior.moves
-    now, damp = _Fit(car, np.where(m, x, prior.mean)), 1e-3
+    now, damp = Fit(car, np.where(m, x, prior.mean)), 1e-3
     for _ in range(_ROUNDS):
         mse = max(float((now.errors**2).mean()), 1e-8)
         value = independent * np.log(mse) + prior.of(now.x)
@@ -274,7 +309,7 @@ def _fitted(car: _Car, sizes: Sizes, x: FloatArray, independent: float) -> _Fit:
             damp = max(6 * damp, 1e-3)
         else:
             break
-        now, damp = _Fit(car, new), max(damp / 6, 1e-6)
+        now, damp = Fit(car, new), max(damp / 6, 1e-6)
         if value - after < 0.01:
             break
     return now
@@ -323,10 +358,10 @@ def _alike(runs: Rows, edges: IntArray) -> IntArray:
     return out
 
 
-class _Products:
+class Products:
     """Sums of squares and products of errors and slopes over the runs of each fold, taught and told."""
 
-    def __init__(self, fit: _Fit, left: LeftOut) -> None:
+    def __init__(self, fit: Fit, left: LeftOut) -> None:
         self.fit, runs = fit, fit.runs.of_run
         edges = np.searchsorted(runs, np.arange(len(fit.runs.first)))
         X = np.column_stack([fit.slopes, fit.errors])
@@ -339,7 +374,7 @@ class _Products:
         self.taught_counts = (~left.told).astype(float) @ counts
         self.seconds = (~left.told).mean(1)
 
-    def steps(self, prior: _Prior, independent: float) -> FloatArray:
+    def steps(self, prior: Prior, independent: float) -> FloatArray:
         """Moves (fold, coefficient) from the fit to what the taught runs of each fold say."""
         m, x = prior.moves.copy(), self.fit.x
         m[-1] = False  # runs bend with the lag
@@ -376,7 +411,7 @@ class FittedForm:
     form: FreeForm
     score: float
     named: float
-    car: _Car = field(repr=False)
+    car: Car = field(repr=False)
     x: FloatArray = field(repr=False)
     independent: float
 
@@ -393,8 +428,8 @@ class FittedForm:
         x = self.x
         if held.any() and not held.all():
             left = LeftOut(held[None], np.zeros(1, np.int64))
-            products = _Products(_Fit(car, x, cut=True), left)
-            x = x + products.steps(_Prior(car, self.form.sizes), self.independent)[0]
+            products = Products(Fit(car, x, cut=True), left)
+            x = x + products.steps(Prior(car, self.form.sizes), self.independent)[0]
         at = Coefficients.of(x[:-1], car.rows.shape)
         force = ForceMap(rows.knots_u, rows.knots_v, at.table, 0.0)(rows.command, rows.speed)
         force = force + at.gain * rows.command
@@ -402,14 +437,14 @@ class FittedForm:
         begins = np.append(np.flatnonzero(rows.starts), len(force))
         for i, j in itertools.pairwise(begins):
             lagged[i:j] = lfilter([1 - keep], [1, -keep], force[i:j], zi=[keep * force[i]])[0]
-        data = car.h.data
+        data = self.hypothesis.data
         adds = lagged + np.interp(rows.speed, rows.knots_v, at.curve)
         return np.interp(data.grid.time, data.time[rows.source], adds)
 
     @property
     def lagged(self) -> Hypothesis:
         """The hypothesis with the lag that the free form was fitted with."""
-        h = self.car.h.copy()
+        h = self.hypothesis.copy()
         h["T_L"] = self.form.T_L
         return h
 
@@ -423,18 +458,21 @@ def fitted_form(h: Hypothesis, baseline: GapPlant | None, bare: Hypothesis) -> F
         return None
     h, bare = _as_a_plant(h), _as_a_plant(bare)
     lags = np.log(sample(h, chains=1, draws=_DRAWS, seed=0, method="laplace")["T_L"].reshape(-1))
-    car = _Car(h, baseline, (float(np.log(h["T_L"])), max(float(lags.std()), _LEAST_LAG_SD)))
+    car = Car.of(h, baseline, (float(np.log(h["T_L"])), max(float(lags.std()), _LEAST_LAG_SD)))
     runs = car.runs(car.lag[0], cut=True)
     left = LeftOut.of(runs, car.edges) if len(runs.of_run) else None
     if left is None:
         return None
     independent = max(len(car.rows.speed) * car.rows.dt / INDEPENDENT_S, 3.0)
-    base = _Car(bare, baseline, (float(np.log(bare["T_L"])), 1.0))
-    over = _squares(_Fit(base, base.zero, cut=True), _Prior(base, Sizes(0.0, 0.0)), left, independent)
+    base = Car.of(bare, baseline, (float(np.log(bare["T_L"])), 1.0))
+    over = squares_of(Fit(base, base.zero, cut=True), Prior(base, Sizes(0.0, 0.0)), left, independent)
     errors = drive(car, car.zero, cut=True)[0]
     named = np.array([_sum_told(errors, runs, told) for told in left.told])
-    found = [_descended(car, left, over, named, sizes, independent) for sizes in _STARTS]
-    return min(found, key=lambda x: x.score)
+    best = best_form(car, left, over, independent)
+    x, sizes = best.fit.x, best.sizes
+    at = Coefficients.of(x[:-1], car.rows.shape)
+    form = FreeForm(car.rows.knots_u, car.rows.knots_v, at, sizes, float(np.exp(x[-1])))
+    return FittedForm(h, form, best.score, left.worse(named, over), car, x, independent)
 
 
 def _as_a_plant(h: Hypothesis) -> Hypothesis:
@@ -448,36 +486,49 @@ def _as_a_plant(h: Hypothesis) -> Hypothesis:
     return fit(rest, 12) if unnamed else rest.evaluate()
 
 
-def _squares(fit: _Fit, prior: _Prior, left: LeftOut, independent: float) -> FloatArray:
+def squares_of(fit: Fit, prior: Prior, left: LeftOut, independent: float) -> FloatArray:
     """Sums of squared errors (fold,) of the told runs, driven with what the other runs of each fold teach."""
-    steps = _Products(fit, left).steps(prior, independent)
+    steps = Products(fit, left).steps(prior, independent)
     runs = fit.runs
     errors = (drive(fit.car, fit.x + d, cut=True)[0] for d in steps)
     return np.array([_sum_told(e, runs, told) for e, told in zip(errors, left.told, strict=True)])
 
 
-def _descended(
-    car: _Car, left: LeftOut, over: FloatArray, named: FloatArray, sizes: Sizes, independent: float
-) -> FittedForm:
-    """From one choice of sizes to the best in its reach: the lag follows the sizes, and these the lag."""
-    fit = _fitted(car, sizes, car.zero, independent)
-    for _ in range(_DESCENTS):
-        products = _Products(_Fit(car, fit.x, cut=True), left)
+class Best(NamedTuple):
+    """The best sizes, the fit at them, and `score`: how they foretell blocks left out, with what they cost."""
 
-        def score(z: Sizes, products: _Products = products) -> float:
-            squares = products.squares(products.steps(_Prior(car, z), independent))
+    score: float
+    sizes: Sizes
+    fit: Fit
+
+
+def best_form(car: Car, left: LeftOut, over: FloatArray, independent: float, tried: Sequence[float] = SIZES) -> Best:
+    """The free form of a car that does best on blocks left out; `over` (fold,): squares of the baseline there; sizes
+    are of those `tried`."""
+    starts = [sizes for sizes in _STARTS if {sizes.resistance, sizes.table} <= set(tried)]
+    found = (_descended(car, left, over, sizes, independent, tried) for sizes in starts)
+    return min(found, key=lambda best: best.score)
+
+
+def _descended(
+    car: Car, left: LeftOut, over: FloatArray, sizes: Sizes, independent: float, tried: Sequence[float]
+) -> Best:
+    """From one choice of sizes to the best in its reach: the lag follows the sizes, and these the lag."""
+    fit = fitted(car, sizes, car.zero, independent)
+    for _ in range(_DESCENTS):
+        products = Products(Fit(car, fit.x, cut=True), left)
+
+        def score(z: Sizes, products: Products = products) -> float:
+            squares = products.squares(products.steps(Prior(car, z), independent))
             return left.worse(squares, over) + 2 * z.nats / independent
 
-        best = min((Sizes(r, f) for r in SIZES for f in SIZES), key=score)
+        best = min((Sizes(r, f) for r in tried for f in tried), key=score)
         if best == sizes:
             break
         sizes = best
-        fit = _fitted(car, sizes, fit.x, independent)
-    told = _squares(_Fit(car, fit.x, cut=True), _Prior(car, sizes), left, independent)
-    at = Coefficients.of(fit.x[:-1], car.rows.shape)
-    form = FreeForm(car.rows.knots_u, car.rows.knots_v, at, sizes, float(np.exp(fit.x[-1])))
-    score_of = left.worse(told, over) + 2 * sizes.nats / independent
-    return FittedForm(car.h, form, score_of, left.worse(named, over), car, fit.x, independent)
+        fit = fitted(car, sizes, fit.x, independent)
+    told = squares_of(Fit(car, fit.x, cut=True), Prior(car, sizes), left, independent)
+    return Best(left.worse(told, over) + 2 * sizes.nats / independent, sizes, fit)
 
 
 def _sum_told(errors: FloatArray, runs: Runs, told: BoolArray) -> float:

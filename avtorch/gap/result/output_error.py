@@ -4,6 +4,7 @@ r"""Free runs of a car with a force table and a resistance, and their slopes by 
 
 a is what the named car does with the commands, u the commands as they arrive, v the speed of the run itself. F and R
 are linear between knots, so one recursion a knot is the exact derivative of a run, whatever covariance the knots have.
+Where u is the speed that a controller misses, the loop is closed: a run that is faster misses less, a dead time later.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from avtorch.gap.answer.budget import HORIZON_S
 
 STEP_S = 0.1
 """Step of the runs [s]: a command is averaged over it, and lags are exact."""
-_SETTLED_S = 1.5  # of a stretch, before a run begins: the lag has forgotten where it started
+SETTLED_S = 1.5  # of a stretch, before a run begins: the lag has forgotten where it started
 _SHORTEST_S = 1.5  # run
 _EVERY_S = 1.0  # between begins
 _RECORD_S = 0.2  # between errors that count
@@ -46,7 +47,8 @@ class Rows(NamedTuple):
     """Rows of all stretches, `dt` [s] apart, about `STEP_S`.
 
     (row,): `command` [m/s²] as it arrives, mean over the step; `speed` [m/s]; `source`, the row of the drives; `starts`
-    of stretches. `knots_u`, `knots_v`: where the tables are told.
+    of stretches. `knots_u`, `knots_v`: where the tables are told. `loop_s`: None, or the dead time [s] after which
+    `command` is the speed that is missing [m/s]; the gain then acts on `feed` (row,), by default on the command.
     """
 
     dt: float
@@ -56,6 +58,8 @@ class Rows(NamedTuple):
     starts: BoolArray
     knots_u: FloatArray
     knots_v: FloatArray
+    loop_s: float | None = None
+    feed: FloatArray | None = None
 
     @property
     def between(self) -> int:
@@ -83,18 +87,27 @@ class Runs:
     of_run: IntArray = field(repr=False)
 
     @classmethod
-    def of(cls, rows: Rows, named: FloatArray, edges: IntArray | None = None) -> Runs:
+    def of(
+        cls,
+        rows: Rows,
+        named: FloatArray,
+        edges: IntArray | None = None,
+        *,
+        longest_s: float = HORIZON_S,
+        settled_s: float = SETTLED_S,
+    ) -> Runs:
         """Begun every second of each stretch, or more rarely in long drives; none goes beyond one of `edges` (edge,),
-        rows that are the stretches' own starts and may be more."""
+        rows that are the stretches' own starts and may be more. `longest_s`, `settled_s`: of a run, and of a stretch
+        before the first one [s]."""
         dt, count = rows.dt, len(rows.speed)
         begins = np.append(np.flatnonzero(rows.starts), count)
         every = max(1, round(_EVERY_S / dt), int(np.ceil(count / _MOST_RUNS)))
-        shortest, settled = max(2, round(_SHORTEST_S / dt)), round(_SETTLED_S / dt)
+        shortest, settled = max(2, round(_SHORTEST_S / dt)), round(settled_s / dt)
         first, end = [], []
         for i, j in itertools.pairwise(begins if edges is None else edges):
             own = np.arange(i + settled if rows.starts[i] else i, j - shortest, every)
             first.append(own)
-            end.append(np.minimum(own + round(HORIZON_S / dt), j))
+            end.append(np.minimum(own + round(longest_s / dt), j))
         a, e = np.concatenate(first), np.concatenate(end)
         return cls(rows, named, a, e, np.repeat(np.arange(len(a)), (e - a - 1) // rows.between))
 
@@ -104,7 +117,8 @@ class Runs:
         return _drive(
             *(self.first, self.end, rows.between, rows.dt, lag, self.named, rows.command, rows.speed, rows.starts),
             *(rows.knots_u, rows.knots_v, np.ascontiguousarray(at.table), at.curve, at.gain),
-            *(len(self.of_run), slopes),
+            rows.command if rows.feed is None else rows.feed,
+            *(-1.0 if rows.loop_s is None else rows.loop_s / rows.dt, len(self.of_run), slopes),
         )
 
 
@@ -139,6 +153,8 @@ def _drive(  # pragma: no cover - compiled
     table: FloatArray,
     curve: FloatArray,
     gain: float,
+    feed: FloatArray,
+    late: float,
     errors: int,
     slopes: bool,
 ) -> tuple[FloatArray, FloatArray]:
@@ -155,7 +171,7 @@ def _drive(  # pragma: no cover - compiled
         w00, w01, w10, w11 = (1 - p) * (1 - q), (1 - p) * q, p * (1 - q), p * q
         n = a * nv + b
         F = w00 * table[a, b] + w01 * table[a, b + 1] + w10 * table[a + 1, b] + w11 * table[a + 1, b + 1]
-        F += gain * command[i]
+        F += gain * feed[i]
         k = 0.0 if starts[i] else keep
         while at < len(first) and first[at] == i:
             begun_x[at] = s
@@ -167,20 +183,36 @@ def _drive(  # pragma: no cover - compiled
         S[n + 1] += (1 - k) * w01
         S[n + nv] += (1 - k) * w10
         S[n + nv + 1] += (1 - k) * w11
-        S[size - 1] += (1 - k) * command[i]
+        S[size - 1] += (1 - k) * feed[i]
     row = 0
-    dx, dv = np.zeros(size), np.zeros(size)
+    dx, dv, du = np.zeros(size), np.zeros(size), np.zeros(size)
+    whole, part = int(late), late - int(late)
+    off, by_off = np.zeros(1), np.zeros((1, 1))  # how much faster a run of a loop is than what was measured
+    if late >= 0.0:
+        longest = 1 + (end - first).max()
+        off, by_off = np.zeros(longest), np.zeros((longest, size if slopes else 1))
     for r in range(len(first)):
         v, x, since = float(speed[first[r]]), float(begun_x[r]), 0
         dx[:] = begun[r]
         dv[:] = 0.0
         for i in range(first[r], end[r] - 1):
-            a, p, _ = _below(command[i], knots_u)
+            u = command[i]
+            if late >= 0.0:
+                off[i - first[r]] = v - speed[i]
+                if slopes:
+                    by_off[i - first[r]] = dv
+                    du[:] = 0.0
+                for k, share in ((i - first[r] - whole, 1.0 - part), (i - first[r] - whole - 1, part)):
+                    if k >= 0 and share > 0.0:
+                        u -= share * off[k]
+                        if slopes:
+                            du -= share * by_off[k]
+            a, p, by_u = _below(u, knots_u)
             b, q, by = _below(v, knots_v)
             n = a * nv + b
             low = (1 - p) * table[a, b] + p * table[a + 1, b]
             high = (1 - p) * table[a, b + 1] + p * table[a + 1, b + 1]
-            F = low + q * (high - low) + gain * command[i]
+            F = low + q * (high - low) + gain * feed[i]
             after = keep * x + (1 - keep) * F
             R = curve[b] + q * (curve[b + 1] - curve[b])
             if slopes:
@@ -193,11 +225,16 @@ def _drive(  # pragma: no cover - compiled
                     d = dv[j]
                     dv[j] = d * (1.0 + bend + fall) + kept * dx[j]
                     dx[j] = keep * dx[j] + force * d
+                if late >= 0.0:
+                    left = (1 - q) * table[a, b] + q * table[a, b + 1]
+                    steep = by_u * ((1 - q) * table[a + 1, b] + q * table[a + 1, b + 1] - left)
+                    dv += new * steep * du
+                    dx += (1 - keep) * steep * du
                 for j, w in ((n, (1 - p) * (1 - q)), (n + 1, (1 - p) * q), (n + nv, p * (1 - q)), (n + nv + 1, p * q)):
                     dv[j] += new * w
                     dx[j] += (1 - keep) * w
-                dv[size - 1] += new * command[i]
-                dx[size - 1] += (1 - keep) * command[i]
+                dv[size - 1] += new * feed[i]
+                dx[size - 1] += (1 - keep) * feed[i]
                 dv[nodes + b] += dt * (1 - q)
                 dv[nodes + b + 1] += dt * q
             v += dt * (named[i] + R) + F * dt - lag * (after - x)

@@ -1,7 +1,7 @@
 """The actuator between command and body: its response over a step in which its target and lag are held.
 
     first order     T a' + a = g                        (Eq. 1; g = K u)
-    rate-limited    a' = (g - a) / T within ± jerk
+    rate-limited    a' = (g - a) / T from -jerk fall to jerk
     second order    tau² a'' + T a' + a = g             (first order at tau = 0)
 
 A step has one part, or two where a late command switches within it. Each part is integrated exactly, for the
@@ -22,6 +22,10 @@ from avtorch.gap.simulator.recursion import scan, scan_pair
 from avtorch.vehicle.glvd import motion_coefficients
 
 _NO_LIMIT = 1e9  # [m/s³] replaces infinity, as infinity times a part of length 0 would be undefined
+
+
+Limits = tuple[Tensor, Tensor]
+"""Most that an acceleration rises, and falls [m/s³]."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +51,17 @@ class ActuatorState:
 
 @dataclass(frozen=True)
 class Actuator:
-    """`tau` [s] None: first order. `jerk` [m/s³] None: no limit; behind a second order it slews the target."""
+    """`tau` [s] None: first order. `jerk` [m/s³] None: no limit; behind a second order it slews the target. A falling
+    acceleration changes `fall` times as fast at most."""
 
     tau: Tensor | None = None
     jerk: Tensor | None = None
+    fall: Tensor | None = None
+
+    @property
+    def limits(self) -> Limits | None:
+        """Of a rising and a falling acceleration."""
+        return None if self.jerk is None else (self.jerk, self.jerk if self.fall is None else self.jerk * self.fall)
 
     def steady_state(self, accel: Tensor) -> ActuatorState:
         """The state at rest at `accel`."""
@@ -76,9 +87,9 @@ class Actuator:
         parts = [part.rows(slice(0, steps)) for part in parts]
         if self.tau is not None:
             return self._second_over(accel0, parts)
-        if self.jerk is None:
+        jerk = self.limits
+        if jerk is None:
             return _first_over(accel0, parts)
-        jerk = self.jerk
 
         def step(before: Tensor, rows: slice) -> tuple[Tensor, Tensor]:
             slope = torch.ones_like(before)
@@ -98,18 +109,19 @@ class Actuator:
 
     def _part(self, state: ActuatorState, part: Substep) -> tuple[ActuatorState, Tensor, Tensor]:
         g, T, h = part.target, part.lag, part.length
+        jerk = self.limits
         if self.tau is None:
-            if self.jerk is None:
+            if jerk is None:
                 alpha, m1, m2 = motion_coefficients(T, h)
                 d = state.accel - g
                 return ActuatorState(g + alpha * d), h * g + m1 * d, 0.5 * h * h * g + m2 * d
-            accel, _, speed = _limited(state.accel, part, self.jerk)
-            return ActuatorState(accel), speed, _limited_place(state.accel, part, self.jerk)
+            accel, _, speed = _limited(state.accel, part, jerk)
+            return ActuatorState(accel), speed, _limited_place(state.accel, part, jerk)
         assert state.swing is not None
         slewed = state.target
-        if self.jerk is not None:
+        if jerk is not None:
             assert slewed is not None
-            slewed, _, g = _slewed(slewed, part, self.jerk)
+            slewed, _, g = _slewed(slewed, part, jerk)
         m00, m01, m10, m11 = modes_over(self.tau, T, h)
         d, w = state.accel - g, state.swing
         accel, swing = g + m00 * d + m01 * w, m10 * d + m11 * w
@@ -120,8 +132,8 @@ class Actuator:
 
     def _second_over(self, accel0: Tensor, parts: list[Substep]) -> tuple[Tensor, Tensor]:
         assert self.tau is not None
-        if self.jerk is not None:
-            parts = _slewed_over(accel0, parts, self.jerk)
+        if self.limits is not None:
+            parts = _slewed_over(accel0, parts, self.limits)
         maps = []
         for part in parts:
             m = modes_over(self.tau, part.lag, part.length)
@@ -169,7 +181,7 @@ def _first_over(accel0: Tensor, parts: list[Substep]) -> tuple[Tensor, Tensor]:
     return a, gained
 
 
-def _limited(a: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _limited(a: Tensor, part: Substep, jerk: Limits) -> tuple[Tensor, Tensor, Tensor]:
     """Rate-limited part from `a`: acceleration after it, its derivative by `a`, change of speed."""
     g, T = part.target, part.lag
     at_limit, cut = _at_limit(a, part, jerk)
@@ -179,7 +191,7 @@ def _limited(a: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor, Te
     return after, 1 + lost, (a + 0.5 * cut) * at_limit + rest * g + T * lost * left
 
 
-def _limited_place(a: Tensor, part: Substep, jerk: Tensor) -> Tensor:
+def _limited_place(a: Tensor, part: Substep, jerk: Limits) -> Tensor:
     """Change of the position over that part, besides `speed length`."""
     at_limit, cut = _at_limit(a, part, jerk)
     rest, left = part.length - at_limit, part.target - a - cut
@@ -187,18 +199,22 @@ def _limited_place(a: Tensor, part: Substep, jerk: Tensor) -> Tensor:
     return place + 0.5 * rest * rest * part.target - motion_coefficients(part.lag, rest)[2] * left
 
 
-def _at_limit(a: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor]:
+def _at_limit(a: Tensor, part: Substep, jerk: Limits) -> tuple[Tensor, Tensor]:
     """Time at the limit, before the exponential part, and the change of the acceleration in it."""
-    J = jerk.clamp_max(_NO_LIMIT)
     d = part.target - a
+    J = _limit(d, jerk)
     at_limit = torch.minimum((d.abs() / J - part.lag).clamp_min(0.0), part.length)
     return at_limit, torch.sign(d) * J * at_limit
 
 
-def _slewed(r: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _limit(d: Tensor, jerk: Limits) -> Tensor:
+    return torch.where(d > 0, *jerk).clamp_max(_NO_LIMIT)
+
+
+def _slewed(r: Tensor, part: Substep, jerk: Limits) -> tuple[Tensor, Tensor, Tensor]:
     """Target after a part, slewed from `r` at no more than `jerk`; its derivative by `r`; its mean over the part."""
-    h, J = part.length, jerk.clamp_max(_NO_LIMIT)
-    d = part.target - r
+    h, d = part.length, part.target - r
+    J = _limit(d, jerk)
     moving = torch.minimum(d.abs() / J, h)
     after = r + torch.maximum(torch.minimum(d, J * h), -J * h)
     # the mean deficit from the target is a shrinking trapezium during the slew, plus the constant rest after it
@@ -207,7 +223,7 @@ def _slewed(r: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor, Ten
     return after, (d.abs() > J * h).to(r.dtype), mean
 
 
-def _slewed_over(accel0: Tensor, parts: list[Substep], jerk: Tensor) -> list[Substep]:
+def _slewed_over(accel0: Tensor, parts: list[Substep], jerk: Limits) -> list[Substep]:
     def step(before: Tensor, rows: slice) -> tuple[Tensor, Tensor]:
         slope = torch.ones_like(before)
         for part in parts:

@@ -42,7 +42,7 @@ PLACES: tuple[Place, ...] = ("command", "actuator", "body", "sensor")
 Example:
     >>> from avtorch.gap import EFFECTS, PLACES
     >>> {place: sum(effect.place == place for effect in EFFECTS.values()) for place in PLACES}
-    {'command': 5, 'actuator': 7, 'body': 6, 'sensor': 4}
+    {'command': 6, 'actuator': 7, 'body': 7, 'sensor': 4}
 """
 
 _LARGEST = 1e12  # limit for a number in a text without a declared domain
@@ -162,7 +162,7 @@ class Effect:
         return self
 
     def actuator_parameters(self) -> Mapping[str, Tensor]:
-        """Fields of `Actuator` that it sets: `tau` [s], `jerk` [m/s³]."""
+        """Fields of `Actuator` that it sets: `tau` [s], `jerk` [m/s³], `fall` [-]."""
         return {}
 
     def accel_limits(self) -> tuple[float, float] | None:
@@ -242,7 +242,7 @@ EFFECTS: dict[str, type[Effect]] = {}
 Example:
     >>> from avtorch.gap import EFFECTS
     >>> len(EFFECTS), [name for name, effect in EFFECTS.items() if effect.place == "sensor"]
-    (22, ['outliers', 'sensor_bias', 'sensor_lag', 'sensor_scale'])
+    (24, ['outliers', 'sensor_bias', 'sensor_lag', 'sensor_scale'])
 """
 
 E = TypeVar("E", bound=type[Effect])

@@ -24,19 +24,23 @@ class LimitedSubstep(Protocol):
     def length(self) -> Tensor: ...
 
 
-def by_rows(start: Tensor, parts: Sequence[LimitedSubstep], jerk: Tensor, *, slews: bool = False) -> Tensor:
-    """States (..., time) after each row, from `start` (...): a first-order lag whose rate is limited by `jerk`, or with
-    `slews` a target that moves to the given one no faster."""
+def by_rows(
+    start: Tensor, parts: Sequence[LimitedSubstep], jerk: tuple[Tensor, Tensor], *, slews: bool = False
+) -> Tensor:
+    """States (..., time) after each row, from `start` (...): a first-order lag which `jerk`, the most that it rises and
+    that it falls, limits; or with `slews` a target that moves to the given one no faster."""
     each = [[x.detach() for x in (p.target, p.lag, p.length)] for p in parts]
-    limit = jerk.detach().clamp_max(1e9)
-    shape = np.broadcast_shapes((*start.shape, 1), (*limit.shape[:-1], 1), *(x.shape for p in each for x in p))
+    limits = [x.detach().clamp_max(1e9) for x in jerk]
+    of_limits = [(*x.shape[:-1], 1) for x in limits]
+    shape = np.broadcast_shapes((*start.shape, 1), *of_limits, *(x.shape for p in each for x in p))
 
     def columns(x: Tensor, time: int) -> FloatArray:
         return x.expand(*shape[:-1], time).reshape(-1, time).numpy()
 
     rows = np.stack([[columns(x, shape[-1]) for x in p] for p in each])
     first = columns(start.detach()[..., None], 1)[:, 0]
-    return torch.from_numpy(_limited(first, rows, columns(limit, 1)[:, 0], slews)).reshape(shape)
+    most = np.stack([columns(x, 1)[:, 0] for x in limits])
+    return torch.from_numpy(_limited(first, rows, most, slews)).reshape(shape)
 
 
 @njit(cache=True, error_model="numpy")
@@ -47,11 +51,12 @@ def _limited(
     _, _, columns, rows = parts.shape
     out = np.empty((columns, rows))
     for c in range(columns):
-        state, J = start[c], limit[c]
+        state, rise, fall = start[c], limit[0, c], limit[1, c]
         for k in range(rows):
             for p in range(parts.shape[0]):
                 g, T, h = parts[p, 0, c, k], parts[p, 1, c, k], parts[p, 2, c, k]
                 d = g - state
+                J = rise if d > 0 else fall
                 if slews:
                     state += min(max(d, -J * h), J * h)
                 else:  # at the limit while it binds, then exponential

@@ -95,5 +95,5 @@ def _shape(effects: list[Effect], row: EffectContext, drive: SimulatorInput) -> 
 def _own_shape(accel0: Tensor, parts: list[Substep], actuator: Actuator) -> torch.Size:
     """The common shape (...) of what moves the actuator."""
     by_row = [x for part in parts for x in (part.target, part.lag, part.length)]
-    by_row += [x for x in (actuator.tau, actuator.jerk) if x is not None]
+    by_row += [x for x in (actuator.tau, actuator.jerk, actuator.fall) if x is not None]
     return torch.Size(np.broadcast_shapes(accel0.shape, *(x.shape[:-1] for x in by_row)))

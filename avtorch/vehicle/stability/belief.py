@@ -22,16 +22,7 @@ BLOCK = 1 << 15  # (setting, draw) pairs held at a time: the temporaries then st
 
 
 class Interval(NamedTuple):
-    """Median and 90 % interval, each (setting,) or of the settings' shape: order statistics, so inf is allowed.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.vehicle.stability import stability_belief
-        >>> T_L = torch.linspace(1.0, 1.6, 101, dtype=torch.float64)  # draws of the lag
-        >>> peak = stability_belief(T_L, K_L=0.5, time_gap=1.0, gains=(1.5, 1.5, -0.8)).margins["peak_gain"]
-        >>> [round(float(q), 2) for q in peak]
-        [1.42, 1.82, 2.43]
-    """
+    """Median and 90 % interval, each (setting,) or of the settings' shape: order statistics, so inf is allowed."""
 
     q05: Float[Tensor, "*setting"]
     q50: Float[Tensor, "*setting"]
@@ -49,16 +40,6 @@ class StabilityBelief:
     - B [-] and C_over_K [1/s^2]: the lines of Eq. 3, without dead time;
     - dead_time [s]: how much more dead time the loop tolerates before it becomes locally unstable;
     - peak_gain [-]: with dead time; inf where locally unstable.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.vehicle.stability import stability_belief
-        >>> T_L, gap = torch.linspace(0.3, 1.5, 121, dtype=torch.float64), torch.tensor([1.0, 1.6, 2.5])
-        >>> belief = stability_belief(T_L, K_L=0.6, time_gap=gap, gains=(1.5, 1.5, -0.8))
-        >>> belief.p_string_stable.round(decimals=2).tolist()  # by time gap
-        [0.0, 0.74, 1.0]
-        >>> sorted(belief.margins)
-        ['B', 'C_over_K', 'dead_time', 'local', 'peak_gain']
     """
 
     p_locally_stable: Float[Tensor, "*setting"]
@@ -77,14 +58,6 @@ def p_locally_stable(
     values. The settings, time_gap (setting,) and gains (setting, 3), broadcast with each other. Draws that leave the
     loop without a stable actuator (T_L < 0 or infinite, K_L <= 0) count as unstable. Raises InputError as
     `local_stable`, and where there is no draw.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.vehicle.stability import p_locally_stable
-        >>> T_L = torch.linspace(0.2, 1.0, 81, dtype=torch.float64)  # draws of the lag
-        >>> p = p_locally_stable(T_L, 1.0, time_gap=1.0, gains=(1.5, 1.5, -0.8), dead_time=0.5)
-        >>> round(float(p), 2)
-        0.38
     """
     return _share(locally_stable, _Blocks(T_L, K_L, time_gap, gains, dead_time, 0.0, 0.0))
 
@@ -122,15 +95,7 @@ def p_locally_and_string_stable(
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
 ) -> tuple[Float[Tensor, "*setting"], Float[Tensor, "*setting"]]:
-    """P(locally stable) and P(string stable), arguments as in `p_string_stable`, in little more time than one of them.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.vehicle.stability import p_locally_and_string_stable
-        >>> T_L = torch.linspace(0.2, 1.8, 161, dtype=torch.float64)  # draws of the lag
-        >>> [float(p) for p in p_locally_and_string_stable(T_L, 0.6, time_gap=1.0, gains=(1.5, 1.5, -0.8))]
-        [1.0, 0.0]
-    """
+    """P(locally stable) and P(string stable), arguments as in `p_string_stable`, in little more time than one."""
     blocks = _Blocks(T_L, K_L, time_gap, gains, dead_time, feedforward, feedforward_delay)
     shares = [[s.full(verdict(s)).double().mean(-1) for verdict in (locally_stable, string_stable_of)] for s in blocks]
     return blocks.join([local for local, _ in shares]), blocks.join([string for _, string in shares])
@@ -146,16 +111,7 @@ def stability_belief(
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
 ) -> StabilityBelief:
-    """Probabilities and margins with intervals, arguments as in `p_string_stable`.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.vehicle.stability import stability_belief
-        >>> T_L = torch.linspace(1.1, 1.6, 101, dtype=torch.float64)  # draws of lag and gain
-        >>> belief = stability_belief(T_L, K_L=0.4 + 0.2 * T_L, time_gap=2.0, gains=(1.5, 1.5, -0.8))
-        >>> round(float(belief.p_string_stable), 2), round(float(belief.margins["peak_gain"].q95), 3)
-        (0.86, 1.024)
-    """
+    """Probabilities and margins with intervals, arguments as in `p_string_stable`."""
     blocks = _Blocks(T_L, K_L, time_gap, gains, dead_time, feedforward, feedforward_delay)
     local: list[Tensor] = []
     string: list[Tensor] = []

@@ -33,15 +33,6 @@ class Chain:
     `motion` (..., frequency): complex acceleration for a unit command; `sensed` (..., frequency): the reading's share
     of the acceleration; `drag` (...) [1/s]: decrease of the acceleration per unit of speed. Raises `InputError` for
     fewer than ten frequencies, frequencies that do not rise from above 0, or responses of another length.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.vehicle.stability import Chain, chain_verdict, frequencies
-        >>> omega = frequencies()
-        >>> slow, late = 1 / (1 + 0.3j * omega), 1 / (1 + 0.2j * omega)  # actuator of 0.3 s, sensor of 0.2 s
-        >>> car = Chain(omega, motion=slow, sensed=late, drag=torch.tensor(0.0))
-        >>> chain_verdict(car, torch.tensor(1.0), torch.tensor([1.5, 1.5, -0.8])).string_stable.item()
-        True
     """
 
     omega: Float[Tensor, " frequency"]
@@ -60,17 +51,7 @@ class Chain:
 
 @dataclass(frozen=True)
 class ChainVerdict:
-    """`locally_stable`, `string_stable` (bool), `peak_gain` [-], inf where locally unstable, of the batch's shape.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.vehicle.stability import actuator, chain_verdict, frequencies
-        >>> T_L, K_L = torch.tensor([0.3, 1.5], dtype=torch.float64), torch.tensor([1.0, 0.5], dtype=torch.float64)
-        >>> cars = actuator(frequencies(), T_L, K_L)
-        >>> verdict = chain_verdict(cars, torch.tensor(1.0), torch.tensor([1.5, 1.5, -0.8]))
-        >>> verdict.string_stable.tolist(), verdict.peak_gain.round(decimals=2).tolist()
-        ([True, False], [1.0, 2.24])
-    """
+    """`locally_stable`, `string_stable` (bool), `peak_gain` [-], inf where locally unstable, of the batch's shape."""
 
     locally_stable: Bool[Tensor, "*batch"]
     string_stable: Bool[Tensor, "*batch"]
@@ -125,14 +106,6 @@ def chain_verdict(
     `time_gap` (...) [s], `gains` (..., 3); the lower level sends `inner` times the sensed acceleration plus `forward`
     times the upper level's demand, (...) (0 and 1: it passes the demand through). `feedforward` k_f (...) [-] acts on
     the leader's acceleration `feedforward_delay` [s] ago.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.vehicle.stability import actuator, chain_verdict, frequencies
-        >>> car = actuator(frequencies(), torch.tensor(0.3), torch.tensor(1.0), torch.tensor([0.0, 0.4, 0.6]))
-        >>> verdict = chain_verdict(car, torch.tensor(1.0), torch.tensor([1.5, 1.5, -0.8]))
-        >>> verdict.peak_gain.round(decimals=2).tolist()  # without dead time, with 0.4 s, with 0.6 s
-        [1.0, 1.74, inf]
     """
     loop, asked = _loop(chain, time_gap, gains, inner, forward, feedforward, feedforward_delay)
     gain = asked.abs() / loop.abs().clamp_min(1e-300)
@@ -153,17 +126,7 @@ def chain_gain(
     feedforward: float | Float[Tensor, "*#batch"] = 0.0,
     feedforward_delay: float = 0.0,
 ) -> Float[Tensor, "*all frequency"]:
-    """`|V / V_lead|` (..., frequency), arguments as in `chain_verdict`; formal where the loop is locally unstable.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.vehicle.stability import actuator, chain_gain
-        >>> omega = torch.linspace(0.5, 5.0, 10, dtype=torch.float64)
-        >>> car = actuator(omega, torch.tensor(0.3), torch.tensor(1.0), dead_time=0.4)
-        >>> size = chain_gain(car, torch.tensor(1.0), torch.tensor([1.5, 1.5, -0.8]))
-        >>> float(omega[size.argmax()]), round(float(size.max()), 2)
-        (3.0, 1.74)
-    """
+    """`|V / V_lead|` (..., frequency), arguments as in `chain_verdict`; formal where the loop is locally unstable."""
     loop, asked = _loop(chain, time_gap, gains, inner, forward, feedforward, feedforward_delay)
     return asked.abs() / loop.abs().clamp_min(1e-300)
 

@@ -22,12 +22,6 @@ class Conditions:
     """The left-minus-right sides of a set of inequalities: each must be > 0.
 
     names: one label a condition. values: (..., condition), -inf where the actuation is no vehicle.
-
-    Example:
-        >>> from avtorch.vehicle.stability import string_conditions
-        >>> eq3 = string_conditions(T_L=1.5, K_L=0.5, time_gap=1.0, gains=(1.5, 1.5, -0.8))
-        >>> dict(zip(eq3.names, eq3.values.round(decimals=3).tolist())), eq3.holds.item()
-        ({'min (1 - K k_a)^2 - 2 T K g': -2.54, 'min K (2 k_s k_a + g^2 - k_v^2) - 2 k_s': -0.825}, False)
     """
 
     names: tuple[str, ...]
@@ -49,12 +43,6 @@ def local_conditions(
     it holds all over the box iff it holds there. On one point the two forms are the same and exact (Routh-Hurwitz).
 
     Raises InputError for an unknown form and for bounds that are not 0 <= T^l <= T^u and 0 < K^l <= K^u.
-
-    Example:
-        >>> from avtorch.vehicle.stability import local_conditions
-        >>> box = local_conditions(T_L=(0.1, 0.4), K_L=(0.7, 1.0), time_gap=1.0, gains=(1.5, 1.5, -0.8))
-        >>> box.holds.item(), round(float(box.values.min()), 2)
-        (True, 1.5)
     """
     low, high = _corners(T_L, K_L, time_gap, gains, form)
     s = high
@@ -78,14 +66,6 @@ def string_conditions(
     form="print": the three printed lines, K^u in the last term of both squares. form="rigorous": the least value over
     the box of B = (1 - K k_a)^2 - 2 T K g, linear in T_L and a convex quadratic in K_L whose vertex may lie inside, and
     of C / K, linear in K_L. Neither form implies local stability: see `string_sufficient`.
-
-    Example:
-        >>> from avtorch.vehicle.stability import string_conditions
-        >>> box = dict(T_L=(0.1, 0.4), K_L=(0.7, 1.0), time_gap=1.0, gains=(1.5, 1.5, -0.8))
-        >>> string_conditions(**box, form="print").values.round(decimals=3).tolist()
-        [0.84, 0.034, 0.045]
-        >>> string_conditions(**box, form="rigorous").values.round(decimals=3).tolist()
-        [0.754, 0.045]
     """
     low, high = _corners(T_L, K_L, time_gap, gains, form)
     s = high

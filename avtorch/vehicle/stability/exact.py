@@ -20,14 +20,6 @@ def string_margins(
 
     B = (1 - K k_a)^2 - 2 T K g [-] is Eq. 3's first line at one point, C / K [1/s^2] its last. With a feed-forward gain
     (no communication delay) B loses K^2 k_f^2 and C gains 2 K^2 k_s k_f. -inf where the actuation is no vehicle.
-
-    Example:
-        >>> from avtorch.vehicle.stability import string_margins
-        >>> B, C = string_margins(T_L=1.5, K_L=0.5, time_gap=2.5, gains=(1.5, 1.5, -0.8))
-        >>> round(float(B), 3), round(float(C / 0.5), 3)
-        (-5.915, 8.456)
-        >>> bool(C >= 0 and (B >= 0 or B**2 <= 4 * 1.5**2 * C))  # the exact condition, though B < 0
-        True
     """
     s = linear_loop(T_L, K_L, time_gap, gains, feedforward=feedforward)
     B, C = broadcast(*coefficients(s))
@@ -43,12 +35,6 @@ def string_margin(
     T_L [s], K_L [-], time_gap [s] and feedforward [-] broadcast with the leading dimensions of gains (..., 3); returns
     that shape, in 1/s^2. One number for both cases of the exact condition: C where B >= 0, else C - B^2 / (4 T^2). It
     does not imply local stability.
-
-    Example:
-        >>> from avtorch.vehicle.stability import string_margin
-        >>> margins = string_margin(T_L=1.5, K_L=0.5, time_gap=[1.0, 2.0, 2.5], gains=(1.5, 1.5, -0.8))
-        >>> (margins >= 0).tolist()  # only the longest gap fulfils the gain condition
-        [False, False, True]
     """
     s = linear_loop(T_L, K_L, time_gap, gains, feedforward=feedforward)
     B, C = coefficients(s)

@@ -21,11 +21,6 @@ def local_stable(
     T_L [s], K_L [-], time_gap [s] and dead_time broadcast with the leading dimensions of gains (..., 3) =
     (k_s [1/s^2], k_v [1/s], k_a [-]); returns bool of that shape. Exact both ways. Feed-forward
     does not enter. T_L < 0, K_L <= 0, infinite or NaN (a lower level that inverts itself unstable) is not stable.
-
-    Example:
-        >>> from avtorch.vehicle.stability import local_stable
-        >>> local_stable(0.3, 1.0, 1.0, (1.5, 1.5, -0.8), dead_time=[0.0, 0.5, 0.6]).tolist()
-        [True, True, False]
     """
     s = linear_loop(T_L, K_L, time_gap, gains, dead_time=dead_time)
     return s.full(locally_stable(s))

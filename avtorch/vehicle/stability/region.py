@@ -25,14 +25,6 @@ class Region:
 
     local: locally stable. string: string stable (form "exact"), or what Eq. 3's box form passes. peak_gain: inf where
     locally unstable; None for the box forms, which are about every vehicle of a box at once.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.vehicle.stability import region
-        >>> axis = torch.linspace(0.1, 3.0, 30)
-        >>> plane = region(("k_s", axis), ("k_v", axis), T_L=1.5, K_L=0.5)
-        >>> tuple(plane.string.shape), plane.local_share > plane.string_share
-        ((30, 30), True)
     """
 
     x_name: str

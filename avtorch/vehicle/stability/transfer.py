@@ -25,12 +25,6 @@ def transfer_function(
 
     With E = exp(-j omega theta): G = K E (k_f s^2 E_f + k_v s + k_s) / (T s^3 + s^2 + K E (-k_a s^2 + g s + k_s)).
     Formal where the loop is locally unstable; 0 where the actuation is no vehicle (T_L < 0, K_L <= 0, not finite).
-
-    Example:
-        >>> from avtorch.vehicle.stability import transfer_function
-        >>> G = transfer_function([0.01, 1.0], T_L=1.5, K_L=0.5, time_gap=1.0, gains=(1.5, 1.5, -0.8))
-        >>> G.dtype, G.abs().round(decimals=3).tolist()
-        (torch.complex128, [1.0, 1.632])
     """
     w = as_tensor(omega, [omega, T_L, K_L, time_gap, gains], "omega")
     s = linear_loop(

@@ -40,6 +40,8 @@ def _of_command(u: FloatArray, a: FloatArray, step: float) -> Iterator[tuple[str
     yield "saturation", [np.maximum(u - high, 0.0), np.minimum(u - low, 0.0)]
     yield "brake_throttle_asymmetry", [np.minimum(u, 0.0), np.where(u < 0, a, 0.0)]
     yield "second_order_actuator", [lagged(a, 0.1, step) - a, lagged(a, 0.3, step) - a]
+    after = np.diff(np.sign(u), prepend=np.sign(u[0])) != 0
+    yield "hand_over", [-u * (np.convolve(after, np.ones(max(1, round(0.4 / step))))[: len(u)] > 0)]
     error = u - a
     yield "rate_limit", [error - np.clip(error, *np.quantile(error, [0.1, 0.9]))]
     late = np.arange(len(u)) / len(u)
@@ -54,6 +56,7 @@ def _of_speed(u: FloatArray, a: FloatArray, v: FloatArray, step: float) -> Itera
     near = sum(np.exp(-(((v - shift) / 0.7) ** 2)) for shift in (5.0, 8.0, 12.5, 20.0))
     yield "gear_shift", [near * np.maximum(u, 0.0)]
     yield "aerodynamic_drag", [v**2]
+    yield "viscous_drag", [v]
     place = np.cumsum(v) * step
     waves = [wave(2 * np.pi * place / length) for length in (300.0, 600.0, 1200.0) for wave in (np.sin, np.cos)]
     yield "road_grade", waves

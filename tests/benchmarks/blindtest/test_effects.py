@@ -81,6 +81,20 @@ def test_rate_limit_bounds_the_jerk_and_nothing_else() -> None:
     close(drive("rate_limit", jerk_max_mps3=100.0), glvd(COMMAND))
 
 
+def test_a_falling_acceleration_has_a_limit_of_its_own() -> None:
+    run = drive("rate_limit", jerk_max_mps3=1.0, fall_ratio=0.5)
+    change = np.diff(run.accel) / DT
+    assert change.max() == pytest.approx(1.0, rel=1e-6)
+    assert change.min() == pytest.approx(-0.5, rel=1e-6)
+
+
+def test_nothing_acts_while_engine_and_brake_change_over() -> None:
+    u = np.repeat([1.0, 0.0, -1.0], 100)
+    run = drive("hand_over", u=u, pause_s=0.3)
+    waited = np.where((np.arange(300) >= 200) & (np.arange(300) * DT < 200 * DT + 0.299), 0.0, u)
+    close(run, glvd(waited))
+
+
 def test_brake_has_its_own_gain_and_lag() -> None:
     p = {"brake_gain_ratio": 0.7, "brake_lag_ratio": 2.0}
     u = np.full(300, -0.5)
@@ -119,6 +133,8 @@ def test_body_forces_at_rest_of_the_command() -> None:
     np.testing.assert_allclose(drag.true_accel[1:], -4e-4 * (drag.true_speed[1:] + 2.0) ** 2, atol=1e-6)
     # dv/dt = -c (v + w)^2 has the solution (v0 + w) / (1 + c (v0 + w) t)
     np.testing.assert_allclose(drag.true_speed, 22.0 / (1 + 4e-4 * 22.0 * drag.time) - 2.0, atol=1e-4)
+    viscous = drive("viscous_drag", u=still, drag_per_s=0.01)
+    np.testing.assert_allclose(viscous.true_speed, 20.0 * np.exp(-0.01 * viscous.time), atol=1e-4)
     resistance = drive("constant_resistance", u=still, resistance_mps2=0.2)
     np.testing.assert_allclose(resistance.true_accel[1:], -0.2, atol=1e-12)
 

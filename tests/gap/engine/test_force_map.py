@@ -204,7 +204,7 @@ def test_a_dead_time_in_front_of_a_map_has_its_name() -> None:
     assert h["T_L"] == pytest.approx(LAG, abs=0.06)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_true_command_has_no_map(seed: int) -> None:
     plain = found(bend=False, seed=seed)
     assert plain.search.map_bases == []

@@ -63,7 +63,12 @@ def test_none_stays_none(rotating_seed: int) -> None:
 
 @pytest.mark.statistical
 @pytest.mark.parametrize(
-    ("effect", "key"), [(DeadTime(DELAY), "delay_s"), (SensorBias(BIAS), "bias_mps2")], ids=["dead_time", "sensor_bias"]
+    ("effect", "key"),
+    [
+        # from the command line in tests/cli/test_diagnose_whole.py, too
+        pytest.param(DeadTime(DELAY), "delay_s", id="dead_time", marks=pytest.mark.slow),
+        pytest.param(SensorBias(BIAS), "bias_mps2", id="sensor_bias"),
+    ],
 )
 def test_an_effect_is_found_with_its_size(effect: Effect, key: str, rotating_seed: int) -> None:
     found = found_in(recorded_log([effect], seed=rotating_seed), FEW)

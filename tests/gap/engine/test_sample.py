@@ -240,7 +240,7 @@ def test_draws_that_are_too_wide_are_noticed():
 
 # where it does not go -------------------------------------------------------------------------------------------------
 def test_without_a_gradient_draws_are_laplaces_and_say_why():
-    h = a_fit("second_order_actuator").with_effect("rate_limit", (0.3,), 20.0).evaluate()
+    h = a_fit("second_order_actuator").with_effect("rate_limit", (0.3, 0.0), 20.0).evaluate()
     draws = sample(h, chains=4, draws=8)
     assert draws.method == "laplace"
     assert "rate_limit" in draws.why

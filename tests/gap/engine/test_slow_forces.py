@@ -291,7 +291,7 @@ def test_an_actuator_at_its_limit_pulls_less() -> None:
     # steepest demand: 2 pi / 10 m/s³; limits from never reached to reached nearly always
     shares = []
     for jerk in (1.0, 0.5, 0.1):
-        lags = pulling_lags(free.with_effect("rate_limit", (1 / jerk,)))
+        lags = pulling_lags(free.with_effect("rate_limit", (1 / jerk, 0.0)))
         assert lags[0] == pytest.approx(T_L)
         shares.append((lags[1] / T_L - 1) / (2 - 1))
         assert np.allclose(lags, T_L * (1 + shares[-1] * (2.0 ** np.arange(len(lags)) - 1)))

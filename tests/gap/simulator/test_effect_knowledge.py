@@ -19,13 +19,16 @@ BENT = ForceTable((0.0, 2.0), (0.0, 30.0), ((0.0, 0.0), (0.0, -1.0)))
     [
         (lambda kind: not is_linear(kind()), NONLINEAR),
         (lambda kind: is_one_sided(kind()), {"saturation", "brake_throttle_asymmetry"}),
-        (lambda kind: push_signs(kind) == {-1}, {"aerodynamic_drag", "constant_resistance"}),
+        (lambda kind: push_signs(kind) == {-1}, {"aerodynamic_drag", "viscous_drag", "constant_resistance"}),
         (lambda kind: push_signs(kind) == {1}, {"low_speed_creep"}),
         (lambda kind: push_signs(kind) == {-1, 1}, {"gust", "road_grade", "sensor_bias"}),
         (is_gain, {"sensor_scale"}),
         (
             lambda kind: kind.memory,
-            {*["gear_shift", "backlash", "dead_time", "sensor_lag", "command_hold", "gust"], "driveline_oscillation"},
+            {
+                *["gear_shift", "backlash", "dead_time", "hand_over", "sensor_lag", "command_hold", "gust"],
+                "driveline_oscillation",
+            },
         ),
         (lambda kind: kind.random, {"gust", "outliers", "command_hold"}),
     ],
@@ -39,7 +42,8 @@ def test_an_effect_is_judged_as_it_is() -> None:
     assert is_one_sided(BENT)
     assert not is_linear(BENT)
     speeds = {name: shown_at(kind()) for name, kind in EFFECTS.items()}
-    assert {name: v for name, v in speeds.items() if v != 12.0} == {"aerodynamic_drag": 25.0, "low_speed_creep": 1.0}
+    other = {"aerodynamic_drag": 25.0, "viscous_drag": 25.0, "low_speed_creep": 1.0}
+    assert {name: v for name, v in speeds.items() if v != 12.0} == other
 
 
 @pytest.mark.parametrize("kind", EFFECTS.values(), ids=lambda kind: kind.name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ import torch
 from avtorch import gap
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, Effect, GapPlant, SimulatorInput, plant
-from avtorch.vehicle import GLVDPlant
+from avtorch.vehicle import Block, GLVDPlant
 from tests.bars import BAR
 from tests.gap.drives import drive_of, driven, filled, smooth_drive
 
@@ -21,16 +22,18 @@ TABLE = {
     "command_hold": ("command", "hold_fraction"),
     "dead_band": ("command", "half_width_mps2"),
     "backlash": ("command", "half_width_mps2"),
+    "hand_over": ("command", "pause_s"),
     "saturation": ("command", "accel_max_mps2", "accel_min_mps2"),
     "brake_throttle_asymmetry": ("actuator", "brake_gain_ratio", "brake_lag_ratio"),
     "second_order_actuator": ("actuator", "natural_frequency_radps", "damping_ratio"),
-    "rate_limit": ("actuator", "jerk_max_mps3"),
+    "rate_limit": ("actuator", "jerk_max_mps3", "fall_ratio"),
     "speed_dependent_lag": ("actuator", "lag_slope"),
     "speed_dependent_gain": ("actuator", "gain_slope"),
     "gain_change": ("actuator", "gain_ratio", "change_s"),
     "gear_shift": ("actuator", "depth", "duration_s"),
     "driveline_oscillation": ("body", "frequency_hz", "amplitude"),
     "aerodynamic_drag": ("body", "drag_per_m"),
+    "viscous_drag": ("body", "drag_per_s"),
     "road_grade": ("body", "grade_rms"),
     "constant_resistance": ("body", "resistance_mps2"),
     "low_speed_creep": ("body", "creep_mps2"),
@@ -52,6 +55,11 @@ def active(cls: type[Effect]) -> Effect:
     return cls(**ACTIVE.get(cls.name, {}))
 
 
+@cache
+def without_effect(T_L: float, K_L: float, *, seconds: float = 4.0, speed0: float = 12.0, **noise: float) -> Block:
+    return driven(GLVDPlant(T_L, K_L, **noise), seconds=seconds, speed0=speed0)
+
+
 def test_all_effects_of_the_contract_with_their_keys() -> None:
     assert {name for name in EFFECTS if name in TABLE} == set(TABLE)
     for name, (place, *keys) in TABLE.items():
@@ -66,7 +74,7 @@ def test_all_effects_of_the_contract_with_their_keys() -> None:
 
 @pytest.mark.parametrize("cls", EVERY, **BY_NAME)
 def test_neutral_is_glvd(cls: type[Effect]) -> None:
-    glvd, car = driven(GLVDPlant(0.4, 0.8)), driven(plant([cls.neutral()], T_L=0.4, K_L=0.8))
+    glvd, car = without_effect(0.4, 0.8), driven(plant([cls.neutral()], T_L=0.4, K_L=0.8), seconds=4.0)
     for name, size in (("accel", 1e-14), ("speed", 1e-12), ("spacing", 1e-7)):  # spacing is 1e6 m with its rounding
         torch.testing.assert_close(getattr(car, name), getattr(glvd, name), rtol=0, atol=size)
 
@@ -77,9 +85,9 @@ def test_neutral_is_glvd(cls: type[Effect]) -> None:
 def test_whole_drive_is_step_by_step(cls: type[Effect]) -> None:
     car = filled(plant([active(cls)], sigma=0.0))
     first = 2.0 if cls.name == "low_speed_creep" else 12.0
-    block = driven(car, speed0=first)
+    block = driven(car, seconds=7.5, speed0=first)
     assert float(block.speed.min()) > 1.0
-    without = driven(GLVDPlant(sigma=0.0), speed0=first)
+    without = without_effect(0.3, 1.0, seconds=7.5, speed0=first, sigma=0.0)
     assert float((block.accel - without.accel).abs().max()) > 1e-3, "the effect does something here"
     response = car.response(drive_of(block))
     # the first row is the loop's own, not the sensor's
@@ -184,7 +192,7 @@ def test_second_order_against_an_ode_solver() -> None:
 @pytest.mark.parametrize("cls", FIXED, **BY_NAME)
 @pytest.mark.parametrize("start", ["settled", "given"])
 def test_gradients(cls: type[Effect], start: str) -> None:
-    drive = smooth_drive()
+    drive = smooth_drive(rows=40, dt=0.1)
     if start == "settled":
         drive = SimulatorInput(drive.time, drive.command, drive.speed)
     car = plant([cls]).prepared(drive)

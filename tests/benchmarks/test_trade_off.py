@@ -3,9 +3,10 @@
 import pytest
 import torch
 
-from avtorch.decision import Setting, gap_trade_off
+from avtorch.decision import Setting
 from avtorch.errors import InputError
 from avtorch.vehicle import stability
+from benchmarks.options.trade_off import gap_trade_off
 
 
 def draws(T=1.5, K=0.5, sd=0.02, n=400):

@@ -6,9 +6,10 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from avtorch import plots
-from avtorch.decision import gap_trade_off
 from avtorch.errors import InputError
+from benchmarks.detectors.operating_curves import operating_curve, operating_figure
+from benchmarks.options.gap_figure import gap_figure
+from benchmarks.options.trade_off import gap_trade_off
 
 
 def curve():
@@ -18,7 +19,7 @@ def curve():
 
 def test_the_curves_are_the_figures() -> None:
     worn = curve()
-    figure = plots.gap_figure({"worn": worn}, marked=(1.6,))
+    figure = gap_figure({"worn": worn}, marked=(1.6,))
     probability, peak, flow = figure.axes
     assert probability.lines[0].get_ydata().tolist() == worn.p_string_stable.tolist()
     assert peak.lines[0].get_ydata().tolist() == worn.peak_gain[1].tolist()
@@ -29,9 +30,9 @@ def test_the_curves_are_the_figures() -> None:
 def test_operating_curves_leave_out_what_is_not_found() -> None:
     inf = float("inf")
     panels = {"drift": {"kl": [(0.1, 0.9, 2.0), (0.01, 0.1, 4.0)], "stability": [(0.9, 0.0, inf)]}}
-    figure = plots.operating_figure(panels)
+    figure = operating_figure(panels)
     (line,) = figure.axes[0].lines
     assert list(line.get_xdata()) == [0.9, 0.1]
     assert list(line.get_ydata()) == [2.0, 4.0]
     with pytest.raises(InputError, match="curves"):
-        plots.operating_curve(Figure().subplots(), {})
+        operating_curve(Figure().subplots(), {})

@@ -22,14 +22,6 @@ from avtorch.vehicle.performance import equilibrium_throughput
 class GapTradeOff:
     """By time gap, every tensor (gap,): `throughput_vph`, `p_string_stable`, `peak_gain` as (5 %, median, 95 %) [-],
     infinite where locally unstable, and `cost_vph`, what is lost against the first gap.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.decision import gap_trade_off
-        >>> T_L = torch.linspace(1.2, 1.6, 81, dtype=torch.float64)
-        >>> trade = gap_trade_off(T_L, torch.full_like(T_L, 0.5), [1.0, 1.6, 2.5])
-        >>> trade.least_gap(), trade.cost_vph.round().tolist()
-        (2.5, [0.0, 791.0, 1359.0])
     """
 
     time_gap: Tensor
@@ -65,14 +57,6 @@ def gap_trade_off(
     `setting` (one scenario, its own time gap unused) gives lower level, gains and feed-forward; `speed` [m/s] is that
     of the traffic. Raises `InputError` for draws or gaps that are not one-dimensional, or a setting of several
     scenarios.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.decision import gap_trade_off
-        >>> T_L = torch.linspace(0.6, 1.2, 61, dtype=torch.float64)  # draws of lag and gain
-        >>> trade = gap_trade_off(T_L, 0.8 - 0.1 * T_L, [1.0, 1.6, 2.5], speed=25.0)
-        >>> trade.p_string_stable.round(decimals=2).tolist(), trade.throughput_vph.round().tolist()
-        ([0.15, 1.0, 1.0], [2609.0, 1818.0, 1250.0])
     """
     gaps = torch.as_tensor(time_gaps, dtype=torch.float64)
     if gaps.ndim != 1 or len(gaps) == 0 or T_L.ndim != 1 or T_L.shape != K_L.shape:

@@ -11,24 +11,13 @@ from matplotlib.figure import Figure
 from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, styled
 
 if TYPE_CHECKING:
-    from avtorch.decision import GapTradeOff
+    from benchmarks.options.trade_off import GapTradeOff
 
 _COLOURS = (VERMILLION, BLUE, GREEN, ORANGE, BLACK)
 
 
 def gap_probability(ax: Axes, curves: Mapping[str, GapTradeOff], *, required: float = 0.95) -> Axes:
-    """P(string stable) over the time gap, one line per curve, by name; the required level in grey.
-
-    Example:
-        >>> import torch
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.decision import gap_trade_off
-        >>> from avtorch.plots import gap_probability
-        >>> T_L = torch.linspace(1.2, 1.6, 41, dtype=torch.float64)
-        >>> curve = gap_trade_off(T_L, torch.full_like(T_L, 0.5), torch.linspace(1.0, 3.0, 9))
-        >>> gap_probability(Figure().subplots(), {"degraded": curve}).get_ylabel()
-        'P(string stable)'
-    """
+    """P(string stable) over the time gap, one line per curve, by name; the required level in grey."""
     for colour, (name, curve) in zip(_COLOURS, curves.items(), strict=False):
         ax.plot(curve.time_gap, curve.p_string_stable, color=colour, label=name)
     ax.axhline(required, color=GREY, linestyle=":", linewidth=1)
@@ -37,18 +26,7 @@ def gap_probability(ax: Axes, curves: Mapping[str, GapTradeOff], *, required: fl
 
 
 def gap_peak(ax: Axes, curves: Mapping[str, GapTradeOff]) -> Axes:
-    """Median peak gain over the time gap, with its 90 % interval.
-
-    Example:
-        >>> import torch
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.decision import gap_trade_off
-        >>> from avtorch.plots import gap_peak
-        >>> T_L = torch.linspace(1.2, 1.6, 41, dtype=torch.float64)
-        >>> curve = gap_trade_off(T_L, torch.full_like(T_L, 0.5), torch.linspace(1.0, 3.0, 9))
-        >>> gap_peak(Figure().subplots(), {"degraded": curve}).get_ylabel()
-        'peak gain [-]'
-    """
+    """Median peak gain over the time gap, with its 90 % interval."""
     for colour, (name, curve) in zip(_COLOURS, curves.items(), strict=False):
         low, middle, high = curve.peak_gain
         ax.plot(curve.time_gap, middle, color=colour, label=name)
@@ -59,18 +37,7 @@ def gap_peak(ax: Axes, curves: Mapping[str, GapTradeOff]) -> Axes:
 
 
 def gap_throughput(ax: Axes, curve: GapTradeOff, *, marked: tuple[float, ...] = ()) -> Axes:
-    """Equilibrium throughput over the time gap; the driver's settings are marked with their numbers.
-
-    Example:
-        >>> import torch
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.decision import gap_trade_off
-        >>> from avtorch.plots import gap_throughput
-        >>> T_L = torch.linspace(1.2, 1.6, 41, dtype=torch.float64)
-        >>> curve = gap_trade_off(T_L, torch.full_like(T_L, 0.5), torch.linspace(1.0, 3.0, 9))
-        >>> gap_throughput(Figure().subplots(), curve, marked=(1.6,)).get_ylabel()
-        'vehicles an hour at 25 m/s'
-    """
+    """Equilibrium throughput over the time gap; the driver's settings are marked with their numbers."""
     ax.plot(curve.time_gap, curve.throughput_vph, color=BLACK)
     for gap in marked:
         i = int((curve.time_gap - gap).abs().argmin())
@@ -83,17 +50,7 @@ def gap_throughput(ax: Axes, curve: GapTradeOff, *, marked: tuple[float, ...] = 
 
 @styled
 def gap_figure(curves: Mapping[str, GapTradeOff], *, marked: tuple[float, ...] = ()) -> Figure:
-    """Probability, peak gain and throughput over the time gap, side by side.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.decision import gap_trade_off
-        >>> from avtorch.plots import gap_figure
-        >>> T_L = torch.linspace(1.2, 1.6, 41, dtype=torch.float64)
-        >>> curve = gap_trade_off(T_L, torch.full_like(T_L, 0.5), torch.linspace(1.0, 3.0, 9))
-        >>> len(gap_figure({"degraded": curve}, marked=(1.0, 1.6, 2.5)).axes)
-        3
-    """
+    """Probability, peak gain and throughput over the time gap, side by side."""
     figure = Figure(figsize=(11.5, 3.6), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     gap_probability(left, curves).set_title("bought: string stability")

@@ -24,13 +24,6 @@ def operating_curve(ax: Axes, curves: Mapping[str, Sequence[Point]]) -> Axes:
 
     Raises:
         InputError: where there is no curve.
-
-    Example:
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.plots import operating_curve
-        >>> curves = {"cusum": [(4.0, 0.05, 2.0), (2.0, 0.2, 1.0)]}  # (threshold, share alarmed, delay [s])
-        >>> len(operating_curve(Figure().subplots(), curves).lines)
-        1
     """
     if not curves:
         raise InputError("curves: found none, needs one or more")
@@ -52,14 +45,7 @@ def operating_curve(ax: Axes, curves: Mapping[str, Sequence[Point]]) -> Axes:
 
 @styled
 def operating_figure(panels: Mapping[str, Mapping[str, Sequence[Point]]]) -> Figure:
-    """One panel a set of curves, by name; one legend.
-
-    Example:
-        >>> from avtorch.plots import operating_figure
-        >>> curves = {"cusum": [(4.0, 0.05, 2.0), (2.0, 0.2, 1.0)]}
-        >>> [ax.get_title("left") for ax in operating_figure({"lag": curves, "gain": curves}).axes]
-        ['lag', 'gain']
-    """
+    """One panel a set of curves, by name; one legend."""
     figure = Figure(figsize=(3.6 * len(panels) + 1.8, 3.6), layout="constrained")
     axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
     for ax, (kind, curves) in zip(axes, panels.items(), strict=True):
