@@ -14,9 +14,12 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -31,7 +34,7 @@ from tests.pedals import cars
 
 _AV21 = {"map": ["throttle=throttle_pct", "brake=brake_kPa"], "unit": ["throttle=%", "brake=kPa"]}
 _ROBORACER = {"map": ["current=current_A"]}
-RECORDINGS: dict[str, tuple[str, dict[str, list[str]]]] = {
+RECORDINGS: dict[str, tuple[str, dict[str, Any]]] = {
     "AV-21": ("indy_av21/Putnam_park2023_run4_2.csv", _AV21),
     "roboracer, one mass": ("roboracer/Normal_1weight.csv", _ROBORACER),
     "roboracer, other mass": ("roboracer/single_mass.csv", _ROBORACER),
@@ -103,10 +106,9 @@ def line(name: str, log: Log) -> str:
     dt = thin / log.rate_hz
     warm, free = round(WARM_S / dt), round(FREE_S / dt)
     given = inputs_of(log, fit.map.pedals)
-    found: dict[str, list[FloatArray]] = {"map": []}
+    errors: list[FloatArray] = []
     for part in parts[1::2]:
-        rows = np.arange(part.start, part.stop)[::thin]
-        at = 0
+        rows, at = np.arange(part.start, part.stop)[::thin], 0
         while at + warm + free // 3 <= len(rows):
             run = rows[at : at + warm + free]
             ok = log.usable[run]
@@ -116,11 +118,9 @@ def line(name: str, log: Log) -> str:
                 continue
             at += free
             assert log.speed is not None
-            for model, made in (("map", fit.map),):
-                inputs = {n: x[run] for n, x in given.items() if x is not None}
-                found[model].append(free_run(made, inputs, log.speed[run], warm, dt))
-    cells = [name, f"{len(found['map'])}"]
-    cells += [f"{np.sqrt(np.mean(np.concatenate(x) ** 2)):.2f}" for x in found.values() if x]
+            inputs = {name: x[run] for name, x in given.items() if x is not None}
+            errors.append(free_run(fit.map, inputs, log.speed[run], warm, dt))
+    cells = [name, f"{len(errors)}", f"{np.sqrt(np.mean(np.concatenate(errors) ** 2)):.3f}"]
     cells += [f"{fit.map.T_L:.2f}", f"{fit.map.dead_time:.2f}", f"± {fit.late_sd:.2f}", f"{seconds:.0f} s"]
     return f"| {' | '.join(cells)} |"
 
@@ -129,14 +129,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--only", default="")
     given = parser.parse_args(arguments)
-    logs = {name: (lambda name=name: read(name, Path(os.environ["AVTORCH_DATA"]))) for name in RECORDINGS}
-    for car in (cars.plain, cars.with_dead_zone):
-        for seed in (101, 102):
-            for recorder in ("ideal", "ordinary"):
-                name = f"known car, {car.__name__}, {recorder} recorder, {seed}"
-                logs[name] = lambda car=car, seed=seed, recorder=recorder: known(
-                    car, seed, ordinary=recorder == "ordinary"
-                )
+    folder = Path(os.environ["AVTORCH_DATA"])
+    logs: dict[str, Callable[[], Log]] = {name: partial(read, name, folder) for name in RECORDINGS}
+    for car, seed, ordinary in product((cars.plain, cars.with_dead_zone), (101, 102), (False, True)):
+        recorder = "ordinary" if ordinary else "ideal"
+        logs[f"known car, {car.__name__}, {recorder} recorder, {seed}"] = partial(known, car, seed, ordinary=ordinary)
     for name, log in logs.items():
         if given.only in name:
             try:

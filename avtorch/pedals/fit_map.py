@@ -129,8 +129,9 @@ def fit_pedals(logs: LogSource | Sequence[LogSource]) -> PedalFit:
     changes = _changes(drive, fit, Prior(fit.car, rough), dead_time, independent)
     score = scored({"map": (fit, sizes), "factor": (factor, FACTOR)}, left, independent)
     lag, late = made.T_L * changes[:, -2], changes[:, -1]
-    sds = [float(np.sqrt((x**2).sum())) for x in (lag, late, lag + late)]
-    return PedalFit(_with_errors(made, drive, fit, changes[:, :-1]), *sds, score, car, sizes, drive.seconds)
+    T_L_sd, dead_time_sd, late_sd = (float(np.sqrt((x**2).sum())) for x in (lag, late, lag + late))
+    made = _with_errors(made, drive, fit, changes[:, :-1])
+    return PedalFit(made, T_L_sd, dead_time_sd, late_sd, score, car, sizes, drive.seconds)
 
 
 def _plant_of(fit: Fit, dead_time: float) -> GapPlant:
