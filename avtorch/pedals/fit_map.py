@@ -19,7 +19,6 @@ from scipy.signal import lfilter
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.gap.effects.dead_time import DeadTime
 from avtorch.gap.engine.priors import FAINT_MAP
 from avtorch.gap.result.free_form import (
     GAIN_SD,
@@ -37,6 +36,7 @@ from avtorch.gap.result.free_form import (
 )
 from avtorch.gap.result.free_form import drive as drive_runs
 from avtorch.gap.result.output_error import Coefficients, Rows
+from avtorch.gap.simulator.effect import delay_effect
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import LogSource
 from avtorch.pedals.held_out import HeldOut, scored
@@ -137,7 +137,8 @@ def fit_pedals(logs: LogSource | Sequence[LogSource]) -> PedalFit:
 def _plant_of(fit: Fit, dead_time: float) -> GapPlant:
     rows, x = fit.car.rows, fit.x
     at, T_L = Coefficients.of(x[:-1], rows.shape), float(np.exp(x[-1]))
-    late = [DeadTime(dead_time)] if dead_time > 0 else []
+    kind = delay_effect()
+    late = [kind.of({str(kind.shift): dead_time})] if dead_time > 0 else []
     forms = FreeForm(rows.knots_u, rows.knots_v, at, _FIRST, T_L).effects()
     return plant([*late, *forms], T_L=T_L, K_L=1.0 + at.gain, sigma=0.0)
 

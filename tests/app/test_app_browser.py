@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ from avtorch.gap import DeadTime, SensorBias, plant
 from tests.report.conftest import browser as browser  # the same Chromium as the report's
 from tests.report.in_chromium import Scheme, marks
 
-pytest.importorskip("panel")
-pytestmark = marks
+# found, not imported: that takes seconds of every worker that only collects
+pytestmark = [*marks, pytest.mark.skipif(find_spec("panel") is None, reason="needs the extra app")]
 LATEST_MS = 400_000  # a diagnosis takes half a minute of a core; CI's machine has two, and other tests
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import threading
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,8 @@ from avtorch.app import serve
 from avtorch.app.workplace import Workplace
 from avtorch.errors import InputError
 
-pytest.importorskip("panel")
+# found, not imported: that takes seconds of every worker that only collects
+pytestmark = pytest.mark.skipif(find_spec("panel") is None, reason="needs the extra app")
 
 
 @pytest.fixture

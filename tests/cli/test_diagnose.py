@@ -337,13 +337,14 @@ def test_table_fits_the_terminal(logs: list[Log], width: int) -> None:
 
 def test_table_of_many_candidates_stays_short(logs: list[Log]) -> None:
     names = [name for name in EFFECTS if name != "dead_time"]
-    weak = tuple(Candidate(name, 0.02, 1.0) for name in names)
+    each = 0.42 / len(names)
+    weak = tuple(Candidate(name, each, 1.0) for name in names)
     found = answer(
         logs, (Candidate("dead_time", 0.5, 9.0), *weak, Candidate("none", 0.04, 0.0), Candidate("unknown", 0.04))
     )
     rows = candidate_table(found, most=8).rows
     assert len(rows) == 8 + 1
-    assert rows[-1][:2] == (f"{len(names) - 5} others", f"{0.02 * (len(names) - 5):.3f}")
+    assert rows[-1][:2] == (f"{len(names) - 5} others", f"{each * (len(names) - 5):.3f}")
     assert {"none", "unknown"} <= {row[0] for row in rows}
 
 
@@ -404,4 +405,4 @@ def test_notes(logs: list[Log], printed: Callable[[Diagnosis], list[str]]) -> No
     )
     many = Candidate("dead_time", 0.3, 9.0), *(Candidate(n, 0.05, 1.0) for n in sorted(EFFECTS) if n != "dead_time")
     told = noted(answer(logs, (*many, *CANDIDATES[-2:])))
-    assert told[0].endswith("command_hold or any of 17 less probable hypotheses.")
+    assert told[0].endswith("command_hold or any of 19 less probable hypotheses.")

@@ -33,7 +33,7 @@ class HandOver(Effect):
         >>> braking = SimulatorInput(time, torch.where(time < 4.0, 1.0, -1.0).double())
         >>> accel = plant([HandOver(0.5)]).response(braking).accel
         >>> round(time[accel < 0][0].item(), 2)  # the brake's first row after 4.5 s
-        4.55
+        4.6
     """
 
     pause_s: Number = 0.3
