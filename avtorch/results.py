@@ -302,6 +302,9 @@ def _agreement_entry(found: Validation, row: int, number: int) -> dict[str, Any]
         "excited": bool(windows.excited[number]),
         "settled": bool(found.sgld.converged[number]),
         "truth": None if truth is None else dict(zip(found.names, truth[number].tolist(), strict=True)),
+        "ksd": finite(float(found.stein.value[number])),
+        "ksd_expected": finite(float(found.stein.expected[number])),
+        "ksd_p": float(found.stein.p_value[number]),
         **{
             name: {measure: finite(float(getattr(table, measure)[row, i])) for measure in measures}
             for i, name in enumerate(found.names)

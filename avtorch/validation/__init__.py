@@ -10,6 +10,7 @@ Example:
 
 from avtorch.validation.agreement import Agreement, AgreementVerdict, agreement, between
 from avtorch.validation.reference import NutsSettings
+from avtorch.validation.stein import Stein, stein_discrepancy
 from avtorch.validation.validate import Validation, validate
 from avtorch.validation.windows import Windows, synthetic_windows, windows_from_prior, windows_of_log
 
@@ -17,10 +18,12 @@ __all__ = [
     "Agreement",
     "AgreementVerdict",
     "NutsSettings",
+    "Stein",
     "Validation",
     "Windows",
     "agreement",
     "between",
+    "stein_discrepancy",
     "synthetic_windows",
     "validate",
     "windows_from_prior",

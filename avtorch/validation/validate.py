@@ -15,6 +15,7 @@ from torch import Tensor
 from avtorch.display import Card, Displayed, Frame
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
+from avtorch.inference.map import find_mode
 from avtorch.inference.posterior import Posterior
 from avtorch.inference.quadrature import Quadrature
 from avtorch.inference.sampler import sample
@@ -34,6 +35,7 @@ from avtorch.validation.reference import (
     select,
     walk_nuts,
 )
+from avtorch.validation.stein import Stein, stein_discrepancy
 from avtorch.validation.windows import Windows, windows_of_log
 
 if TYPE_CHECKING:
@@ -65,6 +67,7 @@ class Validation(Displayed):
         agreement: SGLD against the reference, ``(C, P)`` each.
         nuts_agreement: NUTS against quadrature, ``(M, P)`` each, or None.
         sgld_nuts: SGLD against NUTS, ``(M, P)`` each.
+        stein: kernel Stein discrepancy of SGLD, its null and p-value, ``(W,)`` each.
         seconds: per window, by method: "sgld", "nuts", "quadrature" (0 where it was not run).
         verdict: see `AgreementVerdict`.
 
@@ -89,6 +92,7 @@ class Validation(Displayed):
     agreement: Agreement
     nuts_agreement: Agreement | None
     sgld_nuts: Agreement
+    stein: Stein
     seconds: dict[str, float]
     verdict: AgreementVerdict
 
@@ -224,6 +228,10 @@ def validate(
     sgld = join_draws([b.sgld for b in blocks])
     exact = [b.quadrature for b in blocks if b.quadrature is not None]
     quadrature = join(exact) if exact else None
+    stein = Stein(
+        *(torch.cat([getattr(b.stein, name) for b in blocks]) for name in ("value", "expected", "p_value")),
+        points=blocks[0].stein.points,
+    )
     begun = clock.perf_counter()
     walked = walk_nuts(source, chosen, nuts, seed=seed, done=lambda: count.add(NUTS_SHARE))
     seconds = {
@@ -254,6 +262,7 @@ def validate(
         agreement=found,
         nuts_agreement=against,
         sgld_nuts=sgld_nuts,
+        stein=stein,
         seconds=seconds,
         verdict=verdict,
     )
@@ -279,6 +288,7 @@ class _Block:
 
     sgld: Posterior
     quadrature: Quadrature | None
+    stein: Stein
     sgld_seconds: float
     quadrature_seconds: float
 
@@ -292,8 +302,10 @@ def _block(windows: Windows, settings: SamplerSettings, generator: torch.Generat
     begun = clock.perf_counter()
     quadrature = reference(windows) if len(windows.names) <= 3 else None
     seconds = clock.perf_counter() - begun if quadrature is not None else 0.0
-    count.add(0.7 * len(windows))
-    return _Block(sgld, quadrature, sgld_seconds, seconds)
+    count.add(0.5 * len(windows))
+    stein = stein_discrepancy(density, sgld.draws.log(), mode=find_mode(density), generator=generator)
+    count.add(0.2 * len(windows))
+    return _Block(sgld, quadrature, stein, sgld_seconds, seconds)
 
 
 def _of_windows(posterior: Posterior, index: Tensor) -> Posterior:

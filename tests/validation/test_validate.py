@@ -170,6 +170,7 @@ def test_answer_of_synthetic_windows(windows: Windows, quick_nuts: None) -> None
     assert len(answer["agreement"]) == 4
     for entry in answer["agreement"]:
         assert set(entry["truth"]) == {"T_L", "K_L", "sigma"}
+        assert entry["ksd"] > 0
     again = validate(part, nuts_windows=2, seed=3)
     assert torch.equal(again.sgld.draws, found.sgld.draws)
     groups = found.to_arviz()
