@@ -13,6 +13,7 @@ from avtorch import plots
 from avtorch.inference import Posterior, SamplerSettings, integrate
 from avtorch.validation.agreement import AgreementVerdict, agreement, between
 from avtorch.validation.reference import exact_draws
+from avtorch.validation.stein import Stein
 from avtorch.validation.validate import Validation
 from avtorch.validation.windows import synthetic_windows
 
@@ -32,6 +33,7 @@ def validation() -> Validation:
     drawn = exact_draws(windows.density, exact, chains=2, draws=200, generator=generator)
     nuts = Posterior(drawn.names, drawn.draws[:, :, index], drawn.converged[index])
     own = Posterior(sgld.names, sgld.draws[:, :, index], sgld.converged[index])
+    nothing = torch.zeros(WINDOWS, dtype=torch.float64)
     return Validation(
         windows=windows,
         settings=SamplerSettings(),
@@ -45,6 +47,7 @@ def validation() -> Validation:
         agreement=agreement(sgld, exact),
         nuts_agreement=None,
         sgld_nuts=between(own, nuts),
+        stein=Stein(nothing, nothing, nothing, points=0),
         seconds={},
         verdict=AgreementVerdict(True, 1.0, 0.54, 1.0, 0.9, 0.5, "a test"),
     )
