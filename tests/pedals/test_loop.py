@@ -35,7 +35,7 @@ TRUE = PedalMap(
 )
 
 
-SMOOTH = pytest.mark.xfail(strict=True, reason="without jumps of the command the table over the error is drawn to zero")
+SMOOTH = pytest.mark.xfail(strict=True, reason="a weak controller with a large feed-forward fits smooth commands")
 
 
 @pytest.mark.parametrize("seed", [51, pytest.param(52, marks=pytest.mark.slow)])
