@@ -52,6 +52,12 @@ LONGEST_S = 3.0
 """Of the runs that teach [s]: wind and road add up over longer ones."""
 INDEPENDENT_S = 1.0
 """Taught seconds that count as one independent error of these [s]."""
+LOOP_BEFORE_S = 10.0
+"""How much earlier than what counts the run of a closed loop begins [s]: from a speed that wind has moved it would
+seem to be led back too slowly."""
+_LOOP_KNOTS = 10
+_NEAR_ZERO = 0.12  # standard deviations of the error, within which there is one knot
+_KEPT_ROUNDS = 3  # in which it is seen how long what a loop misses lasts
 _SETTLED_S = 0.1  # of a stretch, before a run begins: a launch is all that a drive has of full pedals
 _SIZES = tuple(size for size in SIZES if size > FAINT_MAP)  # any pedal has a map, any car a resistance
 _FIRST = Sizes(0.3, 0.3)
@@ -114,14 +120,14 @@ def fit_pedals(logs: LogSource | Sequence[LogSource]) -> PedalFit:
         (0.4, 0.4)
     """
     drive = PedalDrive.of(logs)
-    independent = max(drive.seconds / INDEPENDENT_S, 3.0)
-    _, factor = _with_dead_time(drive, FACTOR, independent)
+    kept, independent = _whitening(drive)
+    _, factor = _with_dead_time(drive, FACTOR, independent, kept)
     runs, edges = factor.car.runs(_LAG[0], cut=True), factor.car.edges
     left = LeftOut.of(runs, edges) if len(runs.of_run) else None
     if left is None:
         raise InputError(f"logs: found {len(edges) - 1} blocks of some seconds that count, needs 3 for a map")
     over = squares_of(Fit(factor.car, factor.x, cut=True), Prior(factor.car, FACTOR), left, independent)
-    dead_time, first = _with_dead_time(drive, _FIRST, independent)
+    dead_time, first = _with_dead_time(drive, _FIRST, independent, kept)
     _, sizes, fit = best_form(first.car, left, over, independent, _SIZES)
     car = None if drive.is_loop else _plant_of(fit, dead_time)
     made = _loop_map(drive, fit, dead_time) if car is None else PedalCommand.of_drive(drive).map_of(car)
@@ -183,8 +189,10 @@ def _with_errors(made: PedalMap, drive: PedalDrive, fit: Fit, changes: FloatArra
     return replace(made, pedals=pedals, coasting_sd=np.sqrt((coasting**2).sum(0)))
 
 
-def car_of(drive: PedalDrive, dead_time: float, knots: tuple[FloatArray, FloatArray], slope: float) -> Car:
-    """The car of one constant a pedal, with the commands of a drive as they arrive; `slope`: as `Car.slope`."""
+def car_of(
+    drive: PedalDrive, dead_time: float, knots: tuple[FloatArray, FloatArray], slope: float, kept: float = 0.0
+) -> Car:
+    """The car of one constant a pedal, with the commands of a drive as they arrive; `slope`, `kept`: as of `Car`."""
     u, feed = drive.late(drive.command, dead_time), drive.feed
     closed = dead_time if drive.is_loop else None
     late = None if feed is None else drive.late(feed, dead_time)
@@ -201,17 +209,48 @@ def car_of(drive: PedalDrive, dead_time: float, knots: tuple[FloatArray, FloatAr
         return out
 
     car = Car(rows, named, _LAG).with_runs(LONGEST_S, _SETTLED_S)
-    car.steep, car.slope = (GAIN_SD if drive.is_loop else 0.0), slope
+    car.slope = slope
+    if drive.is_loop:
+        car.steep, car.before_s, car.kept = GAIN_SD, LOOP_BEFORE_S, kept
     return car
 
 
-def _with_dead_time(drive: PedalDrive, sizes: Sizes, independent: float) -> tuple[float, Fit]:
+def _knots(drive: PedalDrive) -> tuple[FloatArray, FloatArray]:
+    """Those of the free form; a loop's limits lie where few rows are, so its errors' knots are even in their root."""
+    u, v = knots_of(drive.command, drive.speed)
+    if drive.is_loop:
+        low, high = np.sqrt(np.maximum([-u[0], u[-1]], 0.0))
+        root = np.linspace(-low, high, _LOOP_KNOTS)
+        u = np.sort(np.append((np.sign(root) * root**2)[root**2 > _NEAR_ZERO * drive.command.std()], 0.0))
+    return u, v
+
+
+def _whitening(drive: PedalDrive) -> tuple[float, float]:
+    """The share of a loop's error that is left in the next one, and how many independent errors the drive has.
+
+    Wind and road last for seconds, and a loop is told by what is new: the rest follows from its slow answer to either.
+    A pedal's runs count as they are.
+    """
+    if not drive.is_loop:
+        return 0.0, max(drive.seconds / INDEPENDENT_S, 3.0)
+    kept, knots, fit = 0.0, _knots(drive), None
+    for _ in range(_KEPT_ROUNDS):
+        car = car_of(drive, _DEAD_TIMES_S[1], knots, SLOPE_SD, kept)
+        fit = fitted(car, _FIRST, car.zero if fit is None else fit.x, len(car.runs(_LAG[0]).of_run))
+        car.kept = 0.0
+        left, of_run = drive_runs(car, fit.x)[0], fit.runs.of_run
+        now, then = (left[k][of_run[1:] == of_run[:-1]] for k in (slice(1, None), slice(-1)))
+        kept = float(np.clip((now * then).sum() / max(float((then**2).sum()), 1e-12), 0.0, 0.99))
+    return kept, float(len(of_run))
+
+
+def _with_dead_time(drive: PedalDrive, sizes: Sizes, independent: float, kept: float) -> tuple[float, Fit]:
     """The dead time [s] and the fit at given sizes."""
-    knots = knots_of(drive.command, drive.speed)
+    knots = _knots(drive)
     known: dict[float, tuple[float, Fit]] = {}
 
     def cost(dead_time: float) -> float:
-        car = car_of(drive, dead_time, knots, 0.0 if sizes == FACTOR else SLOPE_SD)
+        car = car_of(drive, dead_time, knots, 0.0 if sizes == FACTOR else SLOPE_SD, kept)
         near = min(known, key=lambda other: abs(other - dead_time), default=None)
         fit = fitted(car, sizes, car.zero if near is None else known[near][1].x, independent)
         mse = max(float((fit.errors**2).mean()), 1e-8)
@@ -228,7 +267,7 @@ def _with_dead_time(drive: PedalDrive, sizes: Sizes, independent: float) -> tupl
 def _changes(drive: PedalDrive, fit: Fit, prior: Prior, dead_time: float, independent: float) -> FloatArray:
     """Changes (draw, coefficient) whose squares sum to variances, the dead time's last."""
     rows = fit.car.rows
-    aside = car_of(drive, dead_time + _DEAD_TIME_STEP_S, (rows.knots_u, rows.knots_v), fit.car.slope)
+    aside = car_of(drive, dead_time + _DEAD_TIME_STEP_S, (rows.knots_u, rows.knots_v), fit.car.slope, fit.car.kept)
     by_dead_time = (drive_runs(aside, fit.x)[0] - fit.errors) / _DEAD_TIME_STEP_S
     J = np.column_stack([fit.slopes[:, prior.moves], by_dead_time])
     H = independent / max(float((fit.errors**2).sum()), 1e-12) * J.T @ J

@@ -50,14 +50,18 @@ def scored(of: Mapping[str, tuple[Fit, Sizes]], left: LeftOut, independent: floa
     """The score of fits whose blocks are left out in turn: a fifth to a tenth of them, every so-many-th one."""
     out, horizon = {}, 0.0
     for model, (fit, sizes) in of.items():
-        steps = Products(Fit(fit.car, fit.x, cut=True), left).steps(Prior(fit.car, sizes), independent)
+        taught = Fit(fit.car, fit.x, cut=True)
+        steps = Products(taught, left).steps(Prior(fit.car, sizes), independent)
         car = fit.car.with_runs(HORIZON_S)
         runs = car.runs(float(fit.x[-1]), cut=True)
-        squares = np.full(len(runs.first), np.nan)
-        for told, step in zip(left.told[left.way == 0], steps[left.way == 0], strict=True):
+        block, own = (np.searchsorted(car.edges, first, side="right") for first in (runs.first, taught.runs.counts))
+        squares = np.full(len(block), np.nan)
+        for is_told, step in zip(left.told[left.way == 0], steps[left.way == 0], strict=True):
+            told = np.isin(block, own[is_told])
             mean = np.bincount(runs.of_run, drive(car, fit.x + step, cut=True)[0] ** 2, len(told))
             squares[told] = mean[told] / np.bincount(runs.of_run, minlength=len(told))[told]
-        block = np.searchsorted(car.edges, runs.first, side="right")
+        runs_told = np.isfinite(squares)
+        block, squares = block[runs_told], squares[runs_told]
         out[model] = np.array([squares[block == k].mean() for k in np.unique(block)])
         horizon = float((runs.end - runs.first).max()) * car.rows.dt
     return HeldOut(out, horizon)

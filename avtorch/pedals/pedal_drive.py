@@ -64,9 +64,11 @@ class PedalDrive:
                 columns["speed"].append(np.maximum(smooth[:-1], 0.0))
                 columns["starts"].append(np.arange(count) == 0)
                 for name in names:
-                    values = inputs[name]
+                    values = log.speed_cmd if name == ERROR else inputs[name]
                     assert values is not None
-                    columns[name].append(_averaged(edges, time, values[part]))
+                    mean = _averaged(edges, time, values[part])
+                    # of the error no noise is left that the run's own speed does not take away again
+                    columns[name].append(mean - 0.5 * (smooth[:-1] + smooth[1:]) if name == ERROR else mean)
         if not columns["speed"]:
             raise InputError(f"logs: found no stretch of {_SHORTEST_S:g} s that counts, needs some for a map")
         whole = {name: np.concatenate(parts) for name, parts in columns.items()}

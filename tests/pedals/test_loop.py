@@ -35,11 +35,8 @@ TRUE = PedalMap(
 )
 
 
-SMOOTH = pytest.mark.xfail(strict=True, reason="a weak controller with a large feed-forward fits smooth commands")
-
-
 @pytest.mark.parametrize("seed", [51, pytest.param(52, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("steps", [True, pytest.param(False, marks=[pytest.mark.slow, SMOOTH])])
+@pytest.mark.parametrize("steps", [True, False])
 def test_a_known_controller_is_found_again(seed: int, steps: bool) -> None:
     fit = fit_pedals(drive(seed, steps=steps))
     made = fit.map
@@ -86,7 +83,9 @@ def test_slopes_of_a_closed_loop_are_those_of_its_runs() -> None:
 
 @pytest.mark.slow
 def test_it_beats_one_constant_where_the_controller_has_limits() -> None:
-    assert fit_pedals(drive(57, seconds=80.0, steps=True)).held_out.better_than("factor")
+    held_out = fit_pedals(drive(57, steps=True)).held_out
+    # wind leaves 0.1 m/s; one constant cannot have the limits, where a step of the speed is 3 m/s of error
+    assert held_out.rmse("map") < 0.5 * held_out.rmse("factor")
 
 
 def test_the_command_is_what_the_controller_demands() -> None:

@@ -117,12 +117,17 @@ class FreeForm:
 class Car:
     """What a car without a free form does along `rows`: at ln T_L, `named` gives the mean acceleration over each step
     (row,) [m/s²]. `lag`: mean and standard deviation of ln T_L. Of gains that the table has at any size, standard
-    deviations: `steep` [-], and `slope` [-], of their change over a standard deviation of the speed."""
+    deviations: `steep` [-], and `slope` [-], of their change over a standard deviation of the speed.
+
+    Of a closed loop the runs go over whole blocks, begun `before_s` [s] earlier, and errors are whitened: of each, the
+    share `kept` [-] is left in the next."""
 
     steep = 0.0
     slope = 0.0
     longest_s = HORIZON_S
     settled_s = SETTLED_S
+    before_s: float | None = None
+    kept = 0.0
 
     def __init__(self, rows: Rows, named: Callable[[float], FloatArray], lag: tuple[float, float]) -> None:
         self.rows, self.named, self.lag = rows, named, lag
@@ -155,10 +160,13 @@ class Car:
     def runs(self, log_lag: float, *, cut: bool = False) -> Runs:
         """The free runs of the car with that ln T_L; `cut`: none goes beyond its block."""
         if (log_lag, cut) not in self._known:
-            edges = self.edges if cut else None
-            self._known[log_lag, cut] = Runs.of(
-                self.rows, self.named(log_lag), edges, longest_s=self.longest_s, settled_s=self.settled_s
-            )
+            rows, named, settled_s = self.rows, self.named(log_lag), self.settled_s
+            if self.before_s is None:
+                edges = self.edges if cut else None
+                runs = Runs.of(rows, named, edges, longest_s=self.longest_s, settled_s=settled_s)
+            else:
+                runs = Runs.over_blocks(rows, named, self.edges, before_s=self.before_s, settled_s=settled_s)
+            self._known[log_lag, cut] = runs
         return self._known[log_lag, cut]
 
     def with_runs(self, longest_s: float, settled_s: float | None = None) -> Car:
@@ -285,7 +293,19 @@ class Fit:
 def drive(car: Car, x: FloatArray, *, slopes: bool = False, cut: bool = False) -> tuple[FloatArray, FloatArray]:
     """Errors (error,) of the runs at coefficients, and their slopes but for ln T_L."""
     runs = car.runs(float(x[-1]), cut=cut)
-    return runs.drive(float(np.exp(x[-1])), Coefficients.of(x[:-1], car.rows.shape), slopes=slopes)
+    errors, by = runs.drive(float(np.exp(x[-1])), Coefficients.of(x[:-1], car.rows.shape), slopes=slopes)
+    if car.kept:
+        errors = _whitened(errors, runs.of_run, car.kept)
+        by = _whitened(by, runs.of_run, car.kept) if slopes else by
+    return errors, by
+
+
+def _whitened(x: FloatArray, of_run: IntArray, kept: float) -> FloatArray:
+    """Of what is in the runs' rows (error, ...), what is new there: a first-order autoregression's innovations."""
+    out, first = x.copy(), np.append(True, of_run[1:] != of_run[:-1])
+    out[1:] -= kept * x[:-1]
+    out[first] = np.sqrt(1 - kept**2) * x[first]
+    return out
 
 
 def fitted(car: Car, sizes: Sizes, x: FloatArray, independent: float) -> Fit:
@@ -326,7 +346,7 @@ class LeftOut:
     @classmethod
     def of(cls, runs: Runs, edges: IntArray) -> LeftOut | None:
         """None where there are fewer than three blocks with runs of their own."""
-        block = np.searchsorted(edges, runs.first, side="right") - 1  # of each run
+        block = np.searchsorted(edges, runs.counts, side="right") - 1  # of each run
         count = len(edges) - 1
         labels = [np.arange(count) % min(count, _FOLDS)]
         if count >= 6:
@@ -423,7 +443,7 @@ class FittedForm:
     def without(self, without: Sequence[slice]) -> FloatArray:
         """Acceleration [m/s²] on the grid that it adds to the hypothesis at `lagged`, taught by the other rows."""
         car, rows, runs = self.car, self.car.rows, self.car.runs(float(self.x[-1]), cut=True)
-        first, last = rows.source[runs.first], rows.source[runs.end - 1]
+        first, last = rows.source[runs.counts], rows.source[runs.end - 1]
         held = np.any([(last >= r.start) & (first < r.stop) for r in without], axis=0)
         x = self.x
         if held.any() and not held.all():

@@ -74,7 +74,7 @@ class Rows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Free runs over `rows` from row `first` (run,) to before row `end` (run,).
+    """Free runs over `rows` from row `first` (run,) to before row `end` (run,), errors counting from row `counts` on.
 
     `named` (row,) [m/s²]: what the car does without free forms, mean over the step. `of_run` (error,): the run of each
     error.
@@ -84,6 +84,7 @@ class Runs:
     named: FloatArray = field(repr=False)
     first: IntArray = field(repr=False)
     end: IntArray = field(repr=False)
+    counts: IntArray = field(repr=False)
     of_run: IntArray = field(repr=False)
 
     @classmethod
@@ -108,14 +109,34 @@ class Runs:
             own = np.arange(i + settled if rows.starts[i] else i, j - shortest, every)
             first.append(own)
             end.append(np.minimum(own + round(longest_s / dt), j))
-        a, e = np.concatenate(first), np.concatenate(end)
-        return cls(rows, named, a, e, np.repeat(np.arange(len(a)), (e - a - 1) // rows.between))
+        a = np.concatenate(first)
+        return cls._counted(rows, named, a, np.concatenate(end), a)
+
+    @classmethod
+    def over_blocks(
+        cls, rows: Rows, named: FloatArray, edges: IntArray, *, before_s: float, settled_s: float = SETTLED_S
+    ) -> Runs:
+        """One for each block between `edges` (edge,), begun `before_s` [s] earlier where its stretch allows: how it
+        began has faded when it counts."""
+        i, j = edges[:-1], edges[1:]
+        opens = np.flatnonzero(rows.starts)
+        stretch = opens[np.searchsorted(opens, i, side="right") - 1] + round(settled_s / rows.dt)
+        first = np.maximum(i - round(before_s / rows.dt), stretch)
+        counts = np.maximum(i, first)
+        kept = j - counts > max(2, round(_SHORTEST_S / rows.dt))
+        return cls._counted(rows, named, first[kept], j[kept], counts[kept])
+
+    @classmethod
+    def _counted(cls, rows: Rows, named: FloatArray, first: IntArray, end: IntArray, counts: IntArray) -> Runs:
+        of_run = np.repeat(np.arange(len(first)), (end - counts - 1) // rows.between)
+        return cls(rows, named, first, end, counts, of_run)
 
     def drive(self, lag: float, at: Coefficients, *, slopes: bool = False) -> tuple[FloatArray, FloatArray]:
         """Errors (error,) [m/s] of all runs and, with `slopes`, their derivatives (error, coefficient)."""
         rows = self.rows
         return _drive(
-            *(self.first, self.end, rows.between, rows.dt, lag, self.named, rows.command, rows.speed, rows.starts),
+            *(self.first, self.end, self.counts, rows.between, rows.dt, lag),
+            *(self.named, rows.command, rows.speed, rows.starts),
             *(rows.knots_u, rows.knots_v, np.ascontiguousarray(at.table), at.curve, at.gain),
             rows.command if rows.feed is None else rows.feed,
             *(-1.0 if rows.loop_s is None else rows.loop_s / rows.dt, len(self.of_run), slopes),
@@ -141,6 +162,7 @@ def _below(x: float, knots: FloatArray) -> tuple[int, float, float]:  # pragma: 
 def _drive(  # pragma: no cover - compiled
     first: IntArray,
     end: IntArray,
+    counts: IntArray,
     record: int,
     dt: float,
     lag: float,
@@ -186,7 +208,8 @@ def _drive(  # pragma: no cover - compiled
         S[size - 1] += (1 - k) * feed[i]
     row = 0
     dx, dv, du = np.zeros(size), np.zeros(size), np.zeros(size)
-    whole, part = int(late), late - int(late)
+    whole = int(np.floor(late - 0.5))  # a command is the mean over a step, whose middle is half a step on
+    part = late - 0.5 - whole
     off, by_off = np.zeros(1), np.zeros((1, 1))  # how much faster a run of a loop is than what was measured
     if late >= 0.0:
         longest = 1 + (end - first).max()
@@ -202,8 +225,11 @@ def _drive(  # pragma: no cover - compiled
                 if slopes:
                     by_off[i - first[r]] = dv
                     du[:] = 0.0
-                for k, share in ((i - first[r] - whole, 1.0 - part), (i - first[r] - whole - 1, part)):
-                    if k >= 0 and share > 0.0:
+                now = i - first[r]
+                # what is not yet known goes on as by the last step
+                near, more = (now - whole, 1.0 - part) if whole >= 0 else (now, 2.0 - part)
+                for k, share in ((near, more), (near - 1, 1.0 - more)):
+                    if k >= 0:
                         u -= share * off[k]
                         if slopes:
                             du -= share * by_off[k]
@@ -243,7 +269,7 @@ def _drive(  # pragma: no cover - compiled
                 v = 0.0
                 dv[:] = 0.0
             v = min(v, _FASTEST_MPS)
-            since += 1
+            since += i >= counts[r]
             if since == record:
                 since = 0
                 err[row] = v - speed[i + 1]
