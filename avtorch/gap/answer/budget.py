@@ -236,7 +236,7 @@ class Budget:
         >>> from avtorch import Leader, simulate
         >>> from avtorch.gap import ConstantResistance, gap_budget, plant
         >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
-        >>> log = simulate(Leader.default(start=30.0, duration=40.0, dt=0.1), plant=dragging).log()
+        >>> log = simulate(Leader.default(start=30.0, duration=100.0, dt=0.1), plant=dragging).log()
         >>> budget = gap_budget(log, effects=["constant_resistance"])
         >>> part = budget.parts[0]
         >>> part.name, round(part.parameters["resistance_mps2"].mean, 1), budget.verdict
