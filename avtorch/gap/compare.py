@@ -23,16 +23,15 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.gap.answer.change import ChangeCause
-from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.drive_record import FEWEST_BLOCKS, Record, blocks_of
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.joint import JointModel
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.cause_of_change import cause_of_change, dead_time_test
-from avtorch.gap.result.comparison import Change, Comparison, DeadTimeTest, SimulatorChange
-from avtorch.gap.result.diagnosis import LogFacts
+from avtorch.gap.result.comparison import Change, ChangeCause, Comparison, DeadTimeTest, SimulatorChange
+from avtorch.gap.result.diagnosis import BlackBoxSimulator
 from avtorch.gap.result.lag_and_gain import CAR, LagAndGain
+from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.rollout_errors import HORIZON_S, block_squares, reached, rolled_out
 from avtorch.gap.simulator.effect import Effect, chosen_effects
 from avtorch.gap.simulator.plant import GapPlant, plant
@@ -212,14 +211,14 @@ def _gaps(
         weights = np.concatenate([np.ones((1, len(blocks))), weights])
         drawn.append({name: np.sqrt(weights @ x / (weights @ rows)) for name, x in squares.items()})
     return {
-        name: Change(*(_of_draws(x) for x in (drawn[0][name], drawn[1][name], drawn[1][name] / drawn[0][name])))
+        name: Change(
+            *(
+                Quantity.of_resampled(x[0], x[1:])
+                for x in (drawn[0][name], drawn[1][name], drawn[1][name] / drawn[0][name])
+            )
+        )
         for name in drawn[0]
     }
-
-
-def _of_draws(x: FloatArray) -> Quantity:
-    q05, q95 = np.quantile(x[1:], (0.05, 0.95))
-    return Quantity(float(x[0]), float(x[1:].std()), min(float(q05), float(x[0])), max(float(q95), float(x[0])))
 
 
 def _simulator_change(gap: Mapping[str, Change]) -> SimulatorChange:

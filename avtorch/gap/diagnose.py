@@ -13,8 +13,6 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.gap.answer.budget import MATERIAL
-from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.coordinates import EFFECTS, adopt, base_name
 from avtorch.gap.engine.drive_data import DriveData
@@ -25,8 +23,9 @@ from avtorch.gap.engine.priors import UNKNOWN_NATS
 from avtorch.gap.engine.sample import sample
 from avtorch.gap.result import sentences
 from avtorch.gap.result.attribution import RowAttribution, change_attribution, localise, row_attribution
+from avtorch.gap.result.budget import MATERIAL
 from avtorch.gap.result.counted_rows import CountedRows
-from avtorch.gap.result.diagnosis import Diagnosis, LogFacts
+from avtorch.gap.result.diagnosis import BlackBoxSimulator, Diagnosis
 from avtorch.gap.result.family_budget import families_of
 from avtorch.gap.result.free_form import fitted_form
 from avtorch.gap.result.free_runs import Blocks
@@ -43,11 +42,11 @@ from avtorch.gap.result.hypotheses import (
     verdict,
     verdict_names,
 )
+from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.parameters import ParameterPosterior, base_quantities, own_random, renamed
 from avtorch.gap.result.parts import parts_of, said_of_unnamed, unnamed_response
 from avtorch.gap.result.predictive_model import predictive_models
-from avtorch.gap.result.traces import Traces
-from avtorch.gap.result.uncounted import uncounted
+from avtorch.gap.result.traces import Traces, uncounted
 from avtorch.gap.sensor_noise import with_sensor_noise
 from avtorch.gap.simulator.effect import Effect, chosen_effects
 from avtorch.gap.simulator.effect_response import is_observable, lookalikes, not_observable
@@ -125,22 +124,9 @@ def diagnose(
         raise InputError(f"posterior: found {posterior!r}, needs 'laplace' or 'sgld'")
     if not 0 < material < 1:
         raise InputError(f"material: found {material}, needs a share between 0 and 1")
-    if isinstance(baseline, BlackBoxSimulator):
-        beside = baseline.beside(each, given)
-        found = diagnose(
-            beside.logs,
-            baseline=beside.plant,
-            prior=prior,
-            effects=effects,
-            pairs=pairs,
-            posterior=posterior,
-            budget_s=budget_s,
-            material=material,
-            named_only=named_only,
-            seed=seed,
-            progress=given or False,
-        )
-        return beside.told(found)
+    beside = baseline.beside(each, given) if isinstance(baseline, BlackBoxSimulator) else None
+    if beside is not None:
+        each, baseline = list(beside.logs), beside.plant
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = chosen_effects(effects)
     read = [with_sensor_noise(log) for log in each]
@@ -242,7 +228,7 @@ def diagnose(
     after = errors[2] if named else errors[0]
     if free is not None:
         after = rows.errors(free.lagged, free.without([]))
-    return Diagnosis(
+    answer = Diagnosis(
         log=LogFacts.of(each),
         baseline=lag_and_gain,
         gap=gap_size(
@@ -276,6 +262,7 @@ def diagnose(
         parts=parts,
         free_form=None if free is None else free.form,
     )
+    return answer if beside is None else beside.told(answer)
 
 
 STEPS = 1000

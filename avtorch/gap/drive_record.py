@@ -50,27 +50,24 @@ class Cut(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
-    """Drives at the log's own rate, and the positions of the counted rows in one array of rows averaged to `dt` [s].
+class MeasuredRows:
+    """Rows as measured, `group` of them averaged into one, and which of these count.
 
-    `accel`, `speed` (row, group): measured, all drives' rows concatenated; None: not in the log. `time` (row,) [s] from
-    the start of its log; `stamp` (row,) [s] on that log's own clock, `log` (row,) its number; `command` (row,), mean of
-    a group. `source`: index of every counted row in these arrays; `stretch` (counted,) numbers the stretches. `group`:
-    rows averaged into one. `cuts` are the origins of the drives; drives of one segment share a road, and `position`
-    continues along it.
+    `time` (row,) [s] from the start of its log, `stamp` (row,) [s] on that log's own clock, `log` (row,) its number;
+    `command` (row,) [m/s²]; `accel` [m/s²], `speed` [m/s] (row, group) as measured, None where not in the log.
+    `source` (counted,): places of the counted rows; `stretch` (counted,) numbers the stretches without gaps. `dt` [s]
+    of an averaged row.
     """
 
-    drives: tuple[SimulatorInput, ...]
-    cuts: tuple[Cut, ...]
     time: Float[FloatArray, " row"]
     stamp: Float[FloatArray, " row"]
     log: Int[IntArray, " row"]
+    command: Float[FloatArray, " row"]
     accel: Float[FloatArray, "row group"] | None
     speed: Float[FloatArray, "row group"] | None
-    command: Float[FloatArray, " row"]
-    dt: float
     source: Int[IntArray, " counted"]
     stretch: Int[IntArray, " counted"]
+    dt: float
     group: int
 
     @property
@@ -86,6 +83,20 @@ class Record:
     def starts(self) -> Int[IntArray, " stretch"]:
         """Index of each stretch's first counted row."""
         return np.flatnonzero(np.diff(self.stretch, prepend=-1))
+
+    @cached_property
+    def measured(self) -> Float[FloatArray, "channel counted group"]:
+        """Measurements of the channels, (channel, counted, group)."""
+        return np.stack([x[self.source] for x in (self.accel, self.speed) if x is not None])
+
+
+@dataclass(frozen=True, eq=False)
+class Record(MeasuredRows):
+    """Drives at the log's own rate. `cuts` are their origins; drives of one segment share a road, and `position`
+    continues along it."""
+
+    drives: tuple[SimulatorInput, ...]
+    cuts: tuple[Cut, ...]
 
     @classmethod
     def of(cls, logs: Log | Iterable[Log]) -> Record:
@@ -172,11 +183,6 @@ class Record:
         """Responses by drive, (..., time) each, at counted rows: (..., counted, group)."""
         whole = torch.cat([x.unflatten(-1, (-1, self.group)) for x in responses], -2)
         return whole.numpy()[..., self.source, :]
-
-    @cached_property
-    def measured(self) -> Float[FloatArray, "channel counted group"]:
-        """Measurements of the channels, (channel, counted, group)."""
-        return np.stack([x[self.source] for x in (self.accel, self.speed) if x is not None])
 
 
 def grouped(rate: float, least: float) -> int:

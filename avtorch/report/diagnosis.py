@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avtorch.experiment import Experiment
-from avtorch.gap.answer.budget import percent as share_of
-from avtorch.gap.answer.location import UNITS, Axis
 from avtorch.gap.result import sentences
+from avtorch.gap.result.budget import percent as share_of
 from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.location import UNITS, Axis
 from avtorch.gap.result.manoeuvres import Manoeuvre, manoeuvres
 from avtorch.plots import diagnosis as drawings
 from avtorch.plots import drive

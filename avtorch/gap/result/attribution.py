@@ -18,12 +18,12 @@ import numpy as np
 from scipy.signal import lfilter
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.answer.location import Axis, Location
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import EFFECT_NATS
 from avtorch.gap.result.counted_rows import CountedRows
+from avtorch.gap.result.location import Axis, Location
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
 _MOST = 0.95  # share of the cause's effect that a part holds

@@ -15,23 +15,23 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.answer.budget import LIKELY, FamilyShare
 from avtorch.gap.engine.average import ModelAverage
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name
-from avtorch.gap.engine.family import FAMILIES, OWN, family_of
+from avtorch.gap.engine.family import FAMILIES, FORMS, OWN, family_of
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import EFFECT_NATS
 from avtorch.gap.engine.search import Projection, tried
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.budget import LIKELY, FamilyShare
 from avtorch.gap.result.free_form import FittedForm
 from avtorch.gap.result.free_runs import Blocks
+from avtorch.gap.result.gap_budget import resamples
 from avtorch.gap.result.held_out import HeldOut
 from avtorch.gap.result.parameters import ParameterPosterior
 from avtorch.gap.result.parts import AnswerPart, map_size
 
 _DRAWS = 48
-_RESAMPLES = 400
 
 
 def families_of(
@@ -121,7 +121,7 @@ def _size(
     total = np.zeros(_DRAWS)
     if effects:
         total += _drawn_squares(posterior, effects, blocks, rng)
-    if any(part.force_map is not None for part in own) and h.force is not None:
+    if any(part.name is None and part.form not in FORMS for part in own) and h.force is not None:
         if not effects:
             return map_size(h, seed)
         total += map_size(h, seed).mean ** 2
@@ -166,10 +166,7 @@ def _takes_off(held: HeldOut, family: str, seed: int) -> Quantity | None:
     before, after, floor = (x.squares for x in (held.steps[0], held.steps[-1], held.floor))
     scale = np.maximum(np.minimum(floor, after).mean(1), 1e-12)[:, None]
     before, after, less, floor = ((x / scale).mean(0) for x in (before, after, without.squares, floor))
-    pick = np.random.default_rng(seed).integers(0, len(after), (_RESAMPLES, len(after)))
-    pick[0] = np.arange(len(after))
+    pick = resamples(len(after), np.random.default_rng(seed))
     whole = np.maximum((before - np.minimum(floor, after))[pick].mean(1), 1e-9)
     draws = np.clip((less - after)[pick].mean(1) / whole, 0.0, 1.0)
-    q05, q95 = np.quantile(draws, (0.05, 0.95))
-    mean = float(draws[0])
-    return Quantity(mean, float(draws.std()), float(min(q05, mean)), float(max(q95, mean)))
+    return Quantity.of_resampled(draws[0], draws)

@@ -21,7 +21,6 @@ import numpy as np
 from scipy.special import multigammaln  # pyright: ignore[reportAttributeAccessIssue]
 
 from avtorch.arrays import BoolArray, FloatArray
-from avtorch.gap.answer.budget import HORIZON_S
 from avtorch.gap.engine.coordinates import INDEX, base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.family import family_of
@@ -29,8 +28,9 @@ from avtorch.gap.engine.gauss_newton import fit, linear_priors, linearised, pena
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance, whiten
 from avtorch.gap.result.black_box_rest import BlackBox
+from avtorch.gap.result.budget import HORIZON_S
 from avtorch.gap.result.free_form import FittedForm
-from avtorch.gap.result.free_runs import Blocks, compared, measured_readings, readings
+from avtorch.gap.result.free_runs import Blocks, compared, measured_readings, readings, speed_gained
 
 _STEPS = 3  # of a fold's fit
 _DAMPED = (1.0, 0.3, 0.1)  # of a step that loses
@@ -105,20 +105,6 @@ def held_out_errors(chain: Sequence[Hypothesis], free: FittedForm | None = None)
     `free`: a form beside the last, which the repaired simulator carries: what it leaves is the last step.
 
     None where the drives are too short for `FEWEST` blocks.
-
-    Example:
-        >>> from avtorch import Leader, simulate
-        >>> from avtorch.gap import ConstantResistance, plant
-        >>> from avtorch.gap.engine.drive_data import DriveData
-        >>> from avtorch.gap.engine.gauss_newton import fit
-        >>> from avtorch.gap.engine.recorder import base_fit
-        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.05)
-        >>> log = simulate(Leader.default(start=30.0, duration=120.0, dt=0.05), plant=dragging).log()
-        >>> base = base_fit(DriveData.of(log))
-        >>> held = held_out_errors([base, fit(base.with_effect("constant_resistance", (0.1,)))])
-        >>> before, after = (step.squares.sum(-1) for step in held.steps)
-        >>> held.names, bool((after < 0.5 * before).all())
-        (('constant_resistance',), True)
     """
     data = chain[-1].data
     blocks = Blocks.of(data)
@@ -290,13 +276,10 @@ def _with_form(free: FittedForm, blocks: Blocks, beside: Hypothesis | None = Non
     """Of a hypothesis with its free form, which each fold's other blocks teach; `beside`: in place of the form's."""
     h = free.lagged if beside is None else beside
     accel, gained = h.on_grid()
-    grid = h.data.grid
-    step = np.where(grid.starts, 0.0, np.diff(grid.time, prepend=grid.time[:1]))
     errors, residuals = [], []
     for k in range(len(blocks.taught)):
         adds = free.without([rows for rows, fold in zip(blocks.rows, blocks.fold, strict=True) if fold == k])
-        more = np.cumsum(step * np.concatenate([adds[:1], adds[:-1]]))
-        rows = readings(h, accel + adds, gained + more)
+        rows = readings(h, accel + adds, gained + speed_gained(h.data.grid, adds))
         errors.append(measured_readings(h.data) - rows)
         residuals.append(h.data.measured - h.data.transform(compared(h.data, rows)))
     return _scores(h.data, blocks, blocks.stitched(errors), np.array(residuals), np.array(residuals))

@@ -9,6 +9,7 @@ identification (Ljung, System Identification, 2nd ed., 1999, Sec. 16.6).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import correlate, get_window
@@ -35,15 +36,6 @@ class Residuals:
     `time` [s] from the log's start, `command` [m/s²] and `speed` [m/s], None where it was not measured, all (row,);
     `stretch` (row,) numbers stretches without gaps and `step` is the time between their rows [s].
 
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.gap.result.residuals import Residuals
-        >>> from avtorch.gap.result.traces import Traces
-        >>> time, u = np.arange(0.0, 60.0, 0.05), np.zeros(1200)
-        >>> traces = Traces(time, u, ("accel",), u[None] + 0.3, u[None], u[None] + 0.2, u, u.astype(int))
-        >>> left = Residuals.of(traces)
-        >>> round(float(left.before.mean()), 2), round(float(left.after.mean()), 2)
-        (0.3, 0.1)
     """
 
     channel: str
@@ -150,8 +142,7 @@ def _products(u: FloatArray, e: FloatArray, parts: list[IntArray], least: int, m
     return total
 
 
-@dataclass(frozen=True)
-class BinnedMeans:
+class BinnedMeans(NamedTuple):
     """Bins (bin,): their mean place, the residual's mean [m/s²] and its central 90 %, NaN where blocks are too few."""
 
     place: FloatArray
@@ -160,8 +151,7 @@ class BinnedMeans:
     high: FloatArray
 
 
-@dataclass(frozen=True)
-class Spectrum:
+class Spectrum(NamedTuple):
     """Power density [(m/s²)²/Hz] over `frequency` [Hz], each (frequency,), with its central 90 %."""
 
     frequency: FloatArray
@@ -170,8 +160,7 @@ class Spectrum:
     high: FloatArray
 
 
-@dataclass(frozen=True)
-class Correlation:
+class Correlation(NamedTuple):
     """Correlation (lag,) [-] over `lag` [s]; within ± `band` lie 99 % where the two signals are independent."""
 
     lag: FloatArray
