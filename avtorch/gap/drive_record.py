@@ -102,28 +102,17 @@ class Record(MeasuredRows):
     def of(cls, logs: Log | Iterable[Log]) -> Record:
         """The record of one or several logs of one car. Raises `InputError` where nothing usable is left."""
         each = [logs] if isinstance(logs, Log) else list(logs)
-        if not each:
-            raise InputError("logs: none given, needs one or more")
+        same_kind(each)
         drives: list[SimulatorInput] = []
         cuts: list[Cut] = []
         columns: dict[str, list[FloatArray]] = defaultdict(list)
         names = list(dict.fromkeys(log.name for log in each))
-        if len({(log.accel is not None, log.speed is not None) for log in each}) > 1:
-            raise InputError(f"logs: {', '.join(names)} have different channels; needs accel, speed or both in all")
-        kinds = {log.accel_kind for log in each}
-        if len(kinds) > 1:
-            raise InputError(f"logs: {', '.join(names)} have different kinds of accel; needs one in all")
-        specific = "specific-force" in kinds
-        rates = [log.rate_hz for log in each]
-        if max(rates) > 1.02 * min(rates):
-            given = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in each)
-            raise InputError(f"logs: found rates of {given}; needs one rate in all, or one diagnosis each")
-        group = grouped(min(rates), RATE_HZ)
+        specific = each[0].accel_kind == "specific-force"
+        group = grouped(min(log.rate_hz for log in each), RATE_HZ)
         steps = []
         segments = 0
         for number, log in enumerate(each):
-            if log.accel_cmd is None:
-                raise no_command(log, ", which the diagnosis needs")
+            assert log.accel_cmd is not None
             first_segment = segments - int(log.segment[0])
             segments = first_segment + int(log.segment[-1]) + 1
             for cut in rolled(log, group):
@@ -183,6 +172,24 @@ class Record(MeasuredRows):
         """Responses by drive, (..., time) each, at counted rows: (..., counted, group)."""
         whole = torch.cat([x.unflatten(-1, (-1, self.group)) for x in responses], -2)
         return whole.numpy()[..., self.source, :]
+
+
+def same_kind(logs: Sequence[Log]) -> None:
+    """Raises `InputError` for logs without `accel_cmd`, or with different channels, rates or kinds of `accel`."""
+    if not logs:
+        raise InputError("logs: none given, needs one or more")
+    names = ", ".join(dict.fromkeys(log.name for log in logs))
+    for log in logs:
+        if log.accel_cmd is None:
+            raise no_command(log, ", which the diagnosis needs")
+    if len({(log.accel is not None, log.speed is not None) for log in logs}) > 1:
+        raise InputError(f"logs: {names} have different channels; needs accel, speed or both in all")
+    if len({log.accel_kind for log in logs}) > 1:
+        raise InputError(f"logs: {names} have different kinds of accel; needs one in all")
+    rates = [log.rate_hz for log in logs]
+    if max(rates) > 1.02 * min(rates):
+        given = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in logs)
+        raise InputError(f"logs: found rates of {given}; needs one rate in all, or one diagnosis each")
 
 
 def grouped(rate: float, least: float) -> int:

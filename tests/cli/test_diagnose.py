@@ -34,7 +34,7 @@ ROWS = 600
 
 
 def around(mean: float, sd: float) -> Quantity:
-    return Quantity.of_normal(mean, sd)
+    return Quantity(mean, sd, mean - 1.645 * sd, mean + 1.645 * sd)
 
 
 BASELINE = {"T_L": around(0.52, 0.01), "K_L": around(1.02, 0.01)}

@@ -1,13 +1,12 @@
-"""The result of a budget: its parts, random causes, what is unexplained, and the sentence a person reads."""
+"""The gap's budget: its parts, random causes, what is unexplained and where, and the sentence a person reads."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from avtorch.gap.quantity import Quantity, of_fields, plain
-from avtorch.gap.result.location import Location
 from avtorch.gap.simulator.effect import named_cause
 
 HORIZON_S = 10.0
@@ -19,6 +18,40 @@ MATERIAL = 0.03
 unexplained of the gap."""
 LIKELY = 0.5
 """Probability from which a part is named."""
+Axis = Literal["time", "speed", "command", "frequency", "signal"]
+
+UNITS: dict[Axis, str] = {"time": "s", "speed": "m/s", "command": "m/s²", "frequency": "Hz", "signal": ""}
+
+
+@dataclass(frozen=True)
+class Location:
+    """A part of the gap: `begin` to `end` on an `axis`, with its `share` of the cause's contribution.
+
+    Times are on the log's own clock [s], the others [m/s, m/s², Hz]; on the axis `signal` both are `"actuation"` (the
+    car's motion differs) or `"sensing"` (the accelerometer's reading differs). `q_value`: the false-discovery rate at
+    which all parts with a q-value as small are named.
+    """
+
+    axis: Axis
+    begin: float | str
+    end: float | str
+    share: float
+    q_value: float
+
+    def words(self, epoch_s: float = 0.0) -> str:
+        """The part as a phrase; times count from `epoch_s`, the log's start on its own clock."""
+        if isinstance(self.begin, str) or isinstance(self.end, str):
+            return "in the car's motion" if self.begin == "actuation" else "in the accelerometer's reading"
+        if self.axis == "time":
+            return f"from {self.begin - epoch_s:.1f} to {self.end - epoch_s:.1f} s after the log's start"
+        at, unit = "frequencies" if self.axis == "frequency" else f"{self.axis}s", UNITS[self.axis]
+        ends = f"from {self.begin:.2g} to {self.end:.2g}" if self.begin else f"below {self.end:.2g}"
+        return f"at {at} {ends} {unit}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `where` in `diagnosis.json`."""
+        part = {"axis": self.axis, "from": self.begin, "to": self.end}
+        return part | {"share": self.share, "q_value": self.q_value}
 
 
 @dataclass(frozen=True)
@@ -192,11 +225,6 @@ class Budget:
     def left_above_noise(self) -> float:
         """Share of the squared error that is left, with all parts, which is above the floor; the rest is noise."""
         return max(1.0 - (self.floor / self.left) ** 2, 0.0)
-
-    @property
-    def says_something(self) -> bool:
-        """Whether there is more to tell than that nothing material is missing."""
-        return bool(self.parts or self.chance or self.unexplained.material)
 
     @property
     def verdict(self) -> tuple[str, ...]:

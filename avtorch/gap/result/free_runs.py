@@ -73,7 +73,7 @@ class Blocks:
         """Sums (..., block) over each block's rows of `x` (..., row)."""
         return np.stack([x[..., rows].sum(-1) for rows in self.rows], -1)
 
-    def stitched(self, of_folds: Sequence[FloatArray]) -> FloatArray:
+    def stitched(self, of_folds: Sequence[FloatArray] | FloatArray) -> FloatArray:
         """(channel, row): each block's by the fit that was made without it; 0 outside."""
         out = np.zeros_like(of_folds[0])
         for rows, k in zip(self.rows, self.fold, strict=True):

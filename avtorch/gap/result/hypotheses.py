@@ -7,9 +7,9 @@ then right about the shape of the gap and wrong about its origin.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 from avtorch.errors import InputError
 from avtorch.gap.engine.average import ModelAverage, Weight
@@ -20,8 +20,7 @@ from avtorch.gap.engine.outliers import rate_onset
 from avtorch.gap.quantity import Quantity, of_fields, unit_of
 from avtorch.gap.result.budget import LIKELY
 from avtorch.gap.result.parameters import OwnRandom, ParameterPosterior
-from avtorch.gap.simulator.effect import EFFECTS, Effect, candidate_name, delay_effect
-from avtorch.gap.simulator.effect_response import is_observable
+from avtorch.gap.simulator.effect import Effect, candidate_name, delay_effect
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.plant import BASELINE, GapPlant
 from avtorch.io import Log
@@ -128,20 +127,6 @@ class Scope:
     scored: tuple[str, ...] = ()
     not_scored: tuple[str, ...] = ()
     pairs: Literal["all", "some", "none"] = "all"
-
-    @classmethod
-    def of(
-        cls,
-        effects: Sequence[type[Effect]],
-        tried: Collection[str],
-        channels: Collection[str],
-        pairs: Literal["all", "some", "none"],
-    ) -> Self:
-        """The scope of a search among `effects`, limited to those observable in `channels`; `tried`: by name."""
-        own = {e.name: e for e in effects}
-        kinds = own | {n: e for n, e in EFFECTS.items() if n not in own}
-        names = [n for n, e in kinds.items() if is_observable(e, channels)]
-        return cls(tuple(n for n in names if n in tried), tuple(n for n in names if n not in tried), pairs)
 
     @property
     def whole(self) -> bool:

@@ -20,9 +20,8 @@ from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.priors import TEMPER
 from avtorch.gap.engine.search import Search
 from avtorch.gap.quantity import Quantity, of_fields
-from avtorch.gap.result.budget import LIKELY
+from avtorch.gap.result.budget import LIKELY, Location
 from avtorch.gap.result.hypotheses import LEAST_LISTED, part_probability
-from avtorch.gap.result.location import Location
 from avtorch.gap.result.parameters import ParameterPosterior
 from avtorch.io.units import GRAVITY
 

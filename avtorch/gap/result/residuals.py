@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import correlate, get_window
+from scipy.signal import correlate, welch
 from scipy.special import chdtri, stdtrit
 
 from avtorch.arrays import FloatArray, IntArray
@@ -84,18 +84,17 @@ class Residuals:
     def spectrum(self, residual: FloatArray) -> Spectrum | None:
         """Power of `residual` (row,) over frequency; None where no stretch is long enough."""
         size = max(8, round(_SEGMENT_S / self.step))
-        window = np.asarray(get_window("hann", size), float)
-        power = []
+        count, total, frequency = 0, np.zeros(size // 2 + 1), np.zeros(0)
         for rows in self._stretches():
-            for begin in range(0, len(rows) - size + 1, size // 2):
-                part = residual[rows[begin : begin + size]]
-                power.append(np.abs(np.fft.rfft(window * (part - part.mean()))) ** 2)
-        if not power:
+            if parts := (len(rows) - size) // (size // 2) + 1 if len(rows) >= size else 0:
+                frequency, power = welch(residual[rows], 1 / self.step, nperseg=size, noverlap=size - size // 2)
+                count, total = count + parts, total + parts * power
+        if not count:
             return None
-        mean = np.mean(power, 0)[1:] * 2 * self.step / (window**2).sum()
-        freedom = max(2.0, _OVERLAPPED * len(power))
+        mean = total[1:] / count
+        freedom = max(2.0, _OVERLAPPED * count)
         low, high = (freedom / chdtri(freedom, p) for p in (0.05, 0.95))
-        return Spectrum(np.asarray(np.fft.rfftfreq(size, self.step)[1:], np.float64), mean, mean * low, mean * high)
+        return Spectrum(frequency[1:], mean, mean * low, mean * high)
 
     def correlation(self, residual: FloatArray, *, seconds: float = 5.0) -> Correlation:
         """Of `residual` (row,) with the command a lag earlier, from -1 s (a later command) to `seconds`."""

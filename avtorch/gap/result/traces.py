@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
+from avtorch.gap.drive_record import MeasuredRows
 from avtorch.gap.result.budget import BEGIN_S, HORIZON_S
-from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.io import Log
 
 Reason = Literal["driver", "standstill", "gap", "settling"]
@@ -61,6 +61,15 @@ class Traces:
     does: FloatArray = field(repr=False)
     stretch: IntArray = field(repr=False)
     uncounted: tuple[Uncounted, ...] = field(default=(), repr=False)
+
+    @classmethod
+    def of(
+        cls, rows: MeasuredRows, before: FloatArray, after: FloatArray, does: FloatArray, logs: Sequence[Log] = ()
+    ) -> Self:
+        """Of counted rows; `before`, `after` (channel, row, group): the simulator's. `logs`: for what did not count."""
+        at, lines = rows.source, (x.mean(-1) for x in (rows.measured, before, after))
+        left_out = uncounted(logs, rows) if logs else ()
+        return cls(rows.time[at], rows.command[at], rows.channels, *lines, does, rows.stretch, left_out)
 
     @property
     def step(self) -> float:
@@ -116,7 +125,7 @@ class Traces:
         return 100 * (1 - np.divide(error, spread, out=np.full_like(error, np.nan), where=spread > 0))
 
 
-def uncounted(logs: Sequence[Log], record: CountedRows) -> tuple[Uncounted, ...]:
+def uncounted(logs: Sequence[Log], record: MeasuredRows) -> tuple[Uncounted, ...]:
     """What `record`, made of these `logs`, does not count, in order of time."""
     found: list[Uncounted] = []
     for number, counted in enumerate(np.unique(record.log[record.source]).tolist()):
