@@ -169,9 +169,9 @@ class Unexplained:
             return "noise"
         low, high = (round(100 * x) for x in (self.still.q05, self.still.q95))
         if low == 0 and high == 100:
-            return "noise or not: this log is too short to tell it from what a black box may still foretell"
+            return "noise or what a black box may still foretell: this log is too short to tell"
         if high == 100:  # the log bounds it from below alone
-            return f"noise or what a black box may still foretell, {low} % of it surely"
+            return f"noise but for {low} % or more, which a black box may still foretell"
         return f"noise but for {low} to {high} %, which a black box may still foretell"
 
     def places(self, epoch_s: float = 0.0) -> str:
