@@ -123,8 +123,9 @@ def diagnose(
         raise InputError(f"posterior: found {posterior!r}, needs 'laplace' or 'sgld'")
     if not 0 < material < 1:
         raise InputError(f"material: found {material}, needs a share between 0 and 1")
-    beside = baseline.beside(each, given) if isinstance(baseline, BlackBoxSimulator) else None
-    if beside is not None:
+    beside = None
+    if isinstance(baseline, BlackBoxSimulator):
+        beside = baseline.beside(each, given)
         each, baseline = list(beside.logs), beside.plant
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = chosen_effects(effects)

@@ -66,9 +66,10 @@ class CountedRows(MeasuredRows):
         if adds is not None:
             accel, gained = accel + adds, gained + speed_gained(h.data.grid, adds)
         out = readings(h, accel, gained)
-        some = max(3, int(0.5 / data.dt))
-        for i, j in zip(data.bounds[:-1], data.bounds[1:], strict=True) if data.speed is not None else ():
-            out[-1, i:j] += (data.speed[i : i + some] - out[-1, i : i + some]).mean()
+        if data.speed is not None:
+            off, some = data.speed - out[-1], max(3, int(0.5 / data.dt))
+            for i, j in zip(data.bounds[:-1], data.bounds[1:], strict=True):
+                out[-1, i:j] += off[i : i + some].mean()
         return out[:, self._rows]
 
     def errors(self, h: Hypothesis, adds: FloatArray | None = None) -> FloatArray:

@@ -67,9 +67,12 @@ class Traces:
         cls, rows: MeasuredRows, before: FloatArray, after: FloatArray, does: FloatArray, logs: Sequence[Log] = ()
     ) -> Self:
         """Of counted rows; `before`, `after` (channel, row, group): the simulator's. `logs`: for what did not count."""
-        at, lines = rows.source, (x.mean(-1) for x in (rows.measured, before, after))
+        at = rows.source
+        measured, before, after = (x.mean(-1) for x in (rows.measured, before, after))
         left_out = uncounted(logs, rows) if logs else ()
-        return cls(rows.time[at], rows.command[at], rows.channels, *lines, does, rows.stretch, left_out)
+        return cls(
+            rows.time[at], rows.command[at], rows.channels, measured, before, after, does, rows.stretch, left_out
+        )
 
     @property
     def step(self) -> float:
