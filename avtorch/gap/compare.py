@@ -259,7 +259,8 @@ def _horizon(sides: Sequence[_LagAndGain]) -> float:
     """
     records = [side.record for side in sides]
     for horizon in _HORIZONS:
-        if all(_rows_of(_whole(record, horizon)) > _WHOLE_SHARE * record.rows for record in records):
+        rows = [sum(block.stop - block.start for block in _whole(record, horizon)) for record in records]
+        if all(count > _WHOLE_SHARE * record.rows for count, record in zip(rows, records, strict=True)):
             return horizon
     return min(reached(r, _HORIZONS[-1]) for r in records)
 
@@ -272,10 +273,6 @@ def _whole(record: Record, horizon: float) -> list[slice]:
         begin = max(block.start, stretch + round(horizon / record.dt))
         found += [slice(begin, block.stop)] if begin < block.stop else []
     return found if len(found) >= FEWEST_BLOCKS else []
-
-
-def _rows_of(blocks: Sequence[slice]) -> int:
-    return sum(block.stop - block.start for block in blocks)
 
 
 def _gaps(

@@ -131,8 +131,11 @@ class Record(MeasuredRows):
                 steps.append(step)
                 first = max(1, round(0.3 / step))
                 accel0 = None if log.accel is None else float(mean(log.accel)[:first].mean())
-                raw = log.speed if log.speed is None else log.speed[cut]
-                drives.append(_drive(log.elapsed[cut], log.accel_cmd[cut], raw, accel0, specific, position0))
+                own = torch.as_tensor(_even(log.elapsed[cut])), torch.as_tensor(log.accel_cmd[cut])
+                quiet = None
+                if log.speed is not None:
+                    quiet = torch.as_tensor(_quiet(log.speed[cut], float(np.median(np.diff(log.elapsed[cut])))))
+                drives.append(SimulatorInput(*own, quiet, accel0, specific, position0))
                 of_rows = {"time": time, "stamp": log.time[cut][::group], "log": np.full(rows, number)}
                 of_rows |= {"command": mean(log.accel_cmd), "use": (use & settled).astype(float)}
                 measured = {"accel": log.accel, "speed": log.speed}
@@ -206,18 +209,6 @@ def rolled(log: Log, group: int) -> Iterator[slice]:
         rows = (part.stop - part.start) // group
         if rows >= 2 * RATE_HZ:
             yield slice(part.start, part.start + rows * group)
-
-
-def _drive(
-    time: FloatArray,
-    command: FloatArray,
-    speed: FloatArray | None,
-    accel0: float | None,
-    specific: bool,
-    position0: float,
-) -> SimulatorInput:
-    quiet = None if speed is None else torch.as_tensor(_quiet(speed, float(np.median(np.diff(time)))))
-    return SimulatorInput(torch.as_tensor(_even(time)), torch.as_tensor(command), quiet, accel0, specific, position0)
 
 
 def _position(log: Log, drives: Sequence[SimulatorInput], cuts: Sequence[Cut], begun: Cut) -> float:
