@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from avtorch.gap import Budget
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.budget import Budget
 from benchmarks.blindtest.intervals import wilson
 
 

@@ -19,11 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
-from avtorch import Log, compare
+from avtorch import Log, compare, diagnose
 from avtorch.errors import InputError
-from avtorch.gap import gap_budget
-from avtorch.gap.answer.change import ChangeCause
-from avtorch.gap.result.comparison import Comparison
+from avtorch.gap.result.comparison import ChangeCause, Comparison
 from benchmarks.blindtest import MANOEUVRES, Car, DrivePlan, Recorder, draw_car, draw_recorder, put_in_front, simulate
 from benchmarks.blindtest.intervals import wilson
 
@@ -118,7 +116,9 @@ def in_front(folder: Path, size: float, only: str) -> None:
         if only not in name:
             continue
         before, after = ([Log.read(folder / file) for file in side] for side in pair)
-        fitted = gap_budget(before, effects=[]).baseline
+        car = diagnose(before, effects=[]).simulator
+        assert car is not None
+        fitted = {"T_L": float(car.T_L), "K_L": float(car.K_L)}
         print(f"| {name}, untouched | {cell(compare(before, after).cause)} |", flush=True)
         named = alike = total = 0
         for number, effect in enumerate((GAIN, *IN_FRONT)):

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from avtorch import diagnose
 from avtorch.errors import InputError
-from avtorch.gap import EFFECTS, Budget, Part, gap_budget
+from avtorch.gap import EFFECTS
 from avtorch.gap.engine.coordinates import EFFECTS as TRIED
 from avtorch.gap.engine.coordinates import base_name
 from avtorch.gap.engine.drive_data import DriveData
@@ -22,6 +23,7 @@ from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.engine.sample import sample
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.budget import Budget, Part
 from avtorch.io import Log
 from benchmarks.blindtest import IN_FRONT, put_in_front
 from benchmarks.blindtest.in_front_score import SIZE_OF, SIZE_WITHIN
@@ -102,9 +104,17 @@ def closing(rows: Sequence[InFront]) -> list[str]:
     ]
 
 
+def budget_of(log: Log) -> Budget:
+    """Raises `InputError` for a log too short to hold out five blocks."""
+    budget = diagnose(log).budget
+    if budget is None:
+        raise InputError(f"{log.name}: found {log.seconds:.0f} s, needs five blocks of 4 s")
+    return budget
+
+
 def in_front(log: Log, size: float) -> None:
     """Prints a row per effect that no chance decides, and the counts."""
-    control, alone = gap_budget(log), base_fit(DriveData.of(log))
+    control, alone = budget_of(log), base_fit(DriveData.of(log))
     print(f"{HEADER}\n| untouched | | | | | | | {causes(control)} |", flush=True)
     T_L, K_L = control.baseline["T_L"], control.baseline["K_L"]
     rows: list[InFront] = []
@@ -113,7 +123,7 @@ def in_front(log: Log, size: float) -> None:
             continue
         try:
             changed, put_in = put_in_front(log, effect, T_L=T_L, K_L=K_L, size=size, seed=number)
-            budget = gap_budget(changed)
+            budget = budget_of(changed)
         except InputError:
             continue
         before = size_of(control, effect)

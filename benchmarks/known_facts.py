@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from avtorch.gap import Budget
 from avtorch.gap.quantity import Quantity, unit_of
+from avtorch.gap.result.budget import Budget
 from benchmarks.budget_cells import counted, interval
 
 LAG_WITH_DELAY = "T_L with delay_s"

@@ -31,8 +31,6 @@ SLOW = frozenset(
         "avtorch.follower.diagnose_follower.FollowerDiagnosis",
         "avtorch.follower.diagnose_follower.diagnose_follower",
         "avtorch.gap",
-        "avtorch.gap.budget.gap_budget",
-        "avtorch.gap.answer.budget.Budget",
         "avtorch.gap.compare.compare",
         "avtorch.gap.diagnose.diagnose",
         "avtorch.gap.result.diagnosis.Diagnosis",

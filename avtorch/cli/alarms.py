@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from avtorch.errors import InputError, quoted
-from avtorch.gap.result.alarm import Alarm
+from avtorch.gap.result.traces import Alarm
 from avtorch.io import Log
 from avtorch.io.opening import place, read_regular
 

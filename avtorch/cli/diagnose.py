@@ -321,7 +321,7 @@ def diagnose(
 def _limits(drives: Sequence[Log], given: Mapping[str, float | None]) -> Limits:
     """Limits not given are taken from the log. Limits that allow no manoeuvre are refused before the search starts."""
     from avtorch.experiment import Limits, library
-    from avtorch.gap.result.diagnosis import LogFacts
+    from avtorch.gap.result.log_facts import LogFacts
 
     limits = Limits.of_log(LogFacts.of(drives), **given)
     if any(x is not None for x in given.values()) and not library(limits):

@@ -100,9 +100,10 @@ def print_diagnosis(talk: Talk, found: Diagnosis, *, verbose: bool = False) -> N
         talk.lines([*sentences.tested(found), *sentences.budget(found)])
         talk.lines([found.verdict.why], "dim")
     talk.line("")
-    divided = found.budget is not None and found.budget.says_something
-    if found.budget is not None and divided:
-        talk.table(budget_table(found.budget, found.log.epochs_s[0]))
+    budget = found.budget
+    divided = budget is not None and (budget.parts or budget.chance or budget.unexplained.material)
+    if budget is not None and divided:
+        talk.table(budget_table(budget, found.log.epochs_s[0]))
     if verbose or not divided:
         talk.table(candidate_table(found, most=8 if verbose else 5))
     if verbose:

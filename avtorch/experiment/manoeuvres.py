@@ -16,7 +16,7 @@ from scipy.signal import chirp
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
-from avtorch.gap.result.diagnosis import LogFacts
+from avtorch.gap.result.log_facts import LogFacts
 
 LEAST_SPAN_MPS = 1.5
 _LEAST_MPS2 = 0.3

@@ -47,7 +47,7 @@ from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.compare import LEVEL
 from avtorch.gap.drive_record import FEWEST_BLOCKS, Record, blocks_of
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.diagnosis import LogFacts
+from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.rollout_errors import HORIZON_S, block_squares, reached, rolled_out
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant, plant

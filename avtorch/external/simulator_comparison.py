@@ -9,7 +9,7 @@ from typing import Any, Literal
 from avtorch.display import Card, Displayed, Frame
 from avtorch.external.surrogate import Surrogate
 from avtorch.gap.quantity import Quantity, unit_of, words_of
-from avtorch.gap.result.diagnosis import LogFacts
+from avtorch.gap.result.log_facts import LogFacts
 
 Which = Literal["first", "second"]
 MATERIAL = 0.01

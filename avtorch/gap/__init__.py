@@ -10,10 +10,7 @@ Example:
     ('dead_time', 0.4)
 """
 
-from typing import TYPE_CHECKING, Any
-
 from avtorch.gap import effects
-from avtorch.gap.answer.budget import Budget, ChancePart, ChannelError, Part, Unexplained
 from avtorch.gap.effects import (
     AerodynamicDrag,
     Backlash,
@@ -49,9 +46,6 @@ from avtorch.gap.simulator.plant import BASELINE, GapPlant, plant
 from avtorch.gap.simulator.recursion import scan, scan_pair
 from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
 
-if TYPE_CHECKING:
-    from avtorch.gap.budget import gap_budget
-
 __all__ = [
     "BASELINE",
     "EFFECTS",
@@ -60,9 +54,6 @@ __all__ = [
     "AerodynamicDrag",
     "Backlash",
     "BrakeThrottleAsymmetry",
-    "Budget",
-    "ChancePart",
-    "ChannelError",
     "CommandHold",
     "ConstantResistance",
     "DeadBand",
@@ -81,7 +72,6 @@ __all__ = [
     "NoiseChange",
     "Outliers",
     "Parameter",
-    "Part",
     "RateLimit",
     "ResistanceCurve",
     "Response",
@@ -94,22 +84,11 @@ __all__ = [
     "SimulatorInput",
     "SpeedDependentGain",
     "SpeedDependentLag",
-    "Unexplained",
     "ViscousDrag",
     "effect_class",
     "effects",
-    "gap_budget",
     "plant",
     "register",
     "scan",
     "scan_pair",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    """The engine is loaded when first used: its compiled code takes a second."""
-    if name == "gap_budget":
-        from avtorch.gap.budget import gap_budget
-
-        return gap_budget
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,8 +1,9 @@
 """Test whether a change to the car or to the simulator helped, from two sets of drives.
 
-The car: `T_L` and `K_L` are fitted to each set. Their spread between drives of one car is estimated from the blocks of
-the drives, each of which contributes its own score (the sandwich estimator of White 1982), and is never less than the
-posterior's. Differences that a missing effect causes between manoeuvres therefore count as spread, not as a change.
+The car: `T_L` and `K_L` are fitted to each set, behind a recorder of unknown delay and filter. Their spread between
+drives of one car is estimated from the blocks of the drives, each of which contributes its own score (the sandwich
+estimator of White 1982), and is never less than the posterior's. Differences that a missing effect causes between
+manoeuvres therefore count as spread, not as a change.
 
 The cause: T_L alone, K_L alone, dead time, or an effect of the table, whichever explains the drives after best in one
 model of both sides that shares all the rest (`engine.joint`). Where `T_L` or `K_L` differ, the same model tells a
@@ -14,6 +15,7 @@ The simulator: rollout errors over both sets, and their ratio over bootstrapped 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from os import PathLike
 
 import numpy as np
@@ -23,16 +25,17 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.gap.answer.change import ChangeCause
-from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.drive_record import FEWEST_BLOCKS, Record, blocks_of
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.joint import JointModel
+from avtorch.gap.engine.gauss_newton import jacobian, prior_terms, whitened_jacobian
+from avtorch.gap.engine.joint import JointModel, block_scores
+from avtorch.gap.engine.priors import ONE_CHANNEL_HZ
+from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.cause_of_change import cause_of_change, dead_time_test
-from avtorch.gap.result.comparison import Change, Comparison, DeadTimeTest, SimulatorChange
-from avtorch.gap.result.diagnosis import LogFacts
-from avtorch.gap.result.lag_and_gain import CAR, LagAndGain
+from avtorch.gap.result.comparison import Change, ChangeCause, Comparison, DeadTimeTest, SimulatorChange
+from avtorch.gap.result.diagnosis import BlackBoxSimulator
+from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.rollout_errors import HORIZON_S, block_squares, reached, rolled_out
 from avtorch.gap.simulator.effect import Effect, chosen_effects
 from avtorch.gap.simulator.plant import GapPlant, plant
@@ -43,6 +46,8 @@ Simulator = GapPlant | str | PathLike[str] | None
 
 LEVEL = 0.04
 """Significance level: with one car, "no change" is the right answer in more than 95 % of comparisons."""
+_CAR = ("T_L", "K_L")
+_TURNS = 12  # of Gauss-Newton
 _DRAWS = 2000
 _HORIZONS = (HORIZON_S, 5.0, 2.0, 1.0)
 _WHOLE_SHARE = 0.4  # of a side's rows that have a whole rollout behind them
@@ -102,7 +107,7 @@ def compare(
     plants = [b if isinstance(b, GapPlant) else plant([], baseline=b) for b in given]
     if told is not None:
         told("lag and gain of both drives", 0, 2)
-    fitted = [LagAndGain.of(logs, plants[0], name) for logs, name in zip(sides, ("before", "after"), strict=True)]
+    fitted = [_LagAndGain.of(logs, plants[0], name) for logs, name in zip(sides, ("before", "after"), strict=True)]
     one, two = fitted
     if one.record.channels != two.record.channels:
         raise InputError("before, after: have different channels; needs accel, speed or both in both")
@@ -111,7 +116,7 @@ def compare(
     blocks = min(one.blocks, two.blocks)
     # Hotelling's test: two parameters, spreads estimated from this many blocks
     square = float(away @ np.linalg.solve(covariance, away))
-    count = len(CAR)
+    count = len(_CAR)
     statistic = square * (blocks - count) / (count * (blocks - 1))
     p_value = float(fisher.sf(statistic, count, blocks - count))  # pyright: ignore[reportUnknownMemberType]
     sure = float(student.ppf(0.95, blocks - 1))  # pyright: ignore[reportUnknownMemberType]
@@ -121,7 +126,7 @@ def compare(
             Quantity.of_logarithm(two.mean[i], two.covariance[i, i], sure),
             Quantity.of_logarithm(away[i], covariance[i, i], sure),
         )
-        for i, name in enumerate(CAR)
+        for i, name in enumerate(_CAR)
     }
     simulators = [p if b is not None else one.fitted(plants[0]) for p, b in zip(plants, given, strict=True)]
     same = all(x is y or _alike(x, y) for x, y in zip(*sides, strict=False)) and len(sides[0]) == len(sides[1])
@@ -151,6 +156,83 @@ def compare(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _LagAndGain:
+    """One set of drives, `record`: `mean` and `covariance` of ln T_L and ln K_L, estimated from `blocks` blocks."""
+
+    record: Record = field(repr=False)
+    mean: FloatArray
+    covariance: FloatArray = field(repr=False)
+    blocks: int
+
+    @classmethod
+    def of(cls, logs: Sequence[Log], base: GapPlant, which: str) -> _LagAndGain:
+        record = Record.of(logs)
+        blocks = blocks_of(record, fewest=FEWEST_BLOCKS)
+        if len(blocks) < FEWEST_BLOCKS:
+            raise InputError(
+                f"{which}: found {len(blocks)} blocks of 4 s of usable driving, needs {FEWEST_BLOCKS} or more"
+            )
+        try:
+            data = DriveData.of(logs)
+        except InputError:  # no stretch that is long enough for the engine
+            mean, information, scores = _by_rows(record, base, blocks)
+        else:
+            mean, information, scores = _by_engine(data, base)
+        scores = scores - scores.mean(1, keepdims=True)
+        count = scores.shape[1]
+        between = scores @ scores.T * count / (count - 1)
+        inverse = np.linalg.inv(information)
+        root = np.linalg.cholesky(0.5 * (inverse + inverse.T))
+        # in coordinates that whiten the posterior: the spread is no smaller than the posterior's in any direction
+        sizes, axes = np.linalg.eigh(root.T @ between @ root)
+        spread = root @ axes @ np.diag(np.maximum(sizes, 1.0)) @ axes.T @ root.T
+        return cls(record, mean, spread[:2, :2], count)
+
+    def fitted(self, base: GapPlant) -> GapPlant:
+        """The simulator with this lag and gain."""
+        return base.with_values(dict(zip(_CAR, np.exp(self.mean).tolist(), strict=True)))
+
+
+def _by_engine(data: DriveData, base: GapPlant) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """ln T_L and ln K_L (2,) behind a recorder; information (parameter, parameter) and scores (parameter, block)."""
+    alone = data.channel_count == 1
+    h = base_fit(data.below(ONE_CHANNEL_HZ) if alone else data, base, alone=alone)
+    names = h.free
+    J = jacobian(h, names)
+    here = np.array([h[name] for name in _CAR])
+    slopes = np.array([*here, *np.ones(len(names) - 2)])  # of the parameters by the logarithms of the first two
+    W = whitened_jacobian(h, J) * slopes[:, None]
+    information = W @ W.T + np.diag(prior_terms(h, names)[0] * slopes**2)
+    return np.log(here), information, block_scores(h, h.covariance, J, h.residual) * slopes[:, None]
+
+
+def _by_rows(record: Record, base: GapPlant, blocks: Sequence[slice]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The same of rows with white noise of any covariance, for stretches that are too short for a spectrum."""
+
+    def errors(z: FloatArray) -> FloatArray:
+        """(channel, row): of acceleration, and of the speed's rise between rows."""
+        car = base.with_values(dict(zip(_CAR, np.exp(z).tolist(), strict=True)))
+        e = (record.measured - rolled_out(record, car)).mean(-1)
+        for k, channel in enumerate(record.channels):
+            if channel == "speed":
+                e[k] = np.diff(e[k], prepend=e[k, :1]) / record.dt
+                e[k, record.starts] = 0.0
+        return e
+
+    z, step = np.log([float(base.T_L), float(base.K_L)]), 1e-3
+    information, scores = np.eye(2), np.zeros((2, record.rows))
+    for _ in range(_TURNS):
+        e = errors(z)
+        weight = np.linalg.inv(e @ e.T / e.shape[1])
+        J = np.stack([(e - errors(z + step * unit)) / step for unit in np.eye(2)])
+        weighted = np.einsum("pct,cd->pdt", J, weight)
+        information = np.einsum("pdt,qdt->pq", weighted, J) + np.eye(2)
+        scores = np.einsum("pdt,dt->pt", weighted, e)
+        z = z + np.clip(np.linalg.solve(information, scores.sum(1)), -0.5, 0.5)
+    return z, information, np.stack([scores[:, b].sum(1) for b in blocks], 1)
+
+
 def _joint(
     sides: Sequence[Sequence[Log]], base: GapPlant, told: Callable[[str, int, int], None] | None
 ) -> JointModel | None:
@@ -169,7 +251,7 @@ def _alike(one: Log, two: Log) -> bool:
     return all(a is b if a is None or b is None else np.array_equal(a, b) for a, b in signals)
 
 
-def _horizon(sides: Sequence[LagAndGain]) -> float:
+def _horizon(sides: Sequence[_LagAndGain]) -> float:
     """Length of the rollouts [s], up to `HORIZON_S`, that fits the stretches of both sides: errors grow with it.
 
     The longest of which both sides hold enough that is whole. A rollout that begins with its stretch is shorter, and of
@@ -177,7 +259,8 @@ def _horizon(sides: Sequence[LagAndGain]) -> float:
     """
     records = [side.record for side in sides]
     for horizon in _HORIZONS:
-        if all(_rows_of(_whole(record, horizon)) > _WHOLE_SHARE * record.rows for record in records):
+        rows = [sum(block.stop - block.start for block in _whole(record, horizon)) for record in records]
+        if all(count > _WHOLE_SHARE * record.rows for count, record in zip(rows, records, strict=True)):
             return horizon
     return min(reached(r, _HORIZONS[-1]) for r in records)
 
@@ -192,12 +275,8 @@ def _whole(record: Record, horizon: float) -> list[slice]:
     return found if len(found) >= FEWEST_BLOCKS else []
 
 
-def _rows_of(blocks: Sequence[slice]) -> int:
-    return sum(block.stop - block.start for block in blocks)
-
-
 def _gaps(
-    sides: Sequence[LagAndGain], simulators: Sequence[GapPlant], horizon: float, *, same: bool
+    sides: Sequence[_LagAndGain], simulators: Sequence[GapPlant], horizon: float, *, same: bool
 ) -> dict[str, Change]:
     """Rollout errors before and after, by metric; both sides use the same bootstrap draws for the `same` drives."""
     drawn: list[dict[str, FloatArray]] = []
@@ -212,14 +291,14 @@ def _gaps(
         weights = np.concatenate([np.ones((1, len(blocks))), weights])
         drawn.append({name: np.sqrt(weights @ x / (weights @ rows)) for name, x in squares.items()})
     return {
-        name: Change(*(_of_draws(x) for x in (drawn[0][name], drawn[1][name], drawn[1][name] / drawn[0][name])))
+        name: Change(
+            *(
+                Quantity.of_resampled(x[0], x[1:])
+                for x in (drawn[0][name], drawn[1][name], drawn[1][name] / drawn[0][name])
+            )
+        )
         for name in drawn[0]
     }
-
-
-def _of_draws(x: FloatArray) -> Quantity:
-    q05, q95 = np.quantile(x[1:], (0.05, 0.95))
-    return Quantity(float(x[0]), float(x[1:].std()), min(float(q05), float(x[0])), max(float(q95), float(x[0])))
 
 
 def _simulator_change(gap: Mapping[str, Change]) -> SimulatorChange:

@@ -10,11 +10,8 @@ from typing import Literal
 
 import numpy as np
 
-from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.gap.answer.budget import MATERIAL
-from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.coordinates import EFFECTS, adopt, base_name
 from avtorch.gap.engine.drive_data import DriveData
@@ -24,13 +21,13 @@ from avtorch.gap.engine.inference import RANDOM, Inference, infer
 from avtorch.gap.engine.priors import UNKNOWN_NATS
 from avtorch.gap.engine.sample import sample
 from avtorch.gap.result import sentences
-from avtorch.gap.result.attribution import RowAttribution, change_attribution, localise, row_attribution
+from avtorch.gap.result.attribution import change_attribution, localise, row_attribution
+from avtorch.gap.result.budget import MATERIAL
 from avtorch.gap.result.counted_rows import CountedRows
-from avtorch.gap.result.diagnosis import Diagnosis, LogFacts
-from avtorch.gap.result.family_budget import families_of
+from avtorch.gap.result.diagnosis import BlackBoxSimulator, Diagnosis
 from avtorch.gap.result.free_form import fitted_form
 from avtorch.gap.result.free_runs import Blocks
-from avtorch.gap.result.gap_budget import budget_of, shrinkage_of
+from avtorch.gap.result.gap_budget import budget_of, families_of, shrinkage_of
 from avtorch.gap.result.gap_size import Simulated, gap_size
 from avtorch.gap.result.held_out import held_out_errors, nested
 from avtorch.gap.result.hypotheses import (
@@ -43,16 +40,17 @@ from avtorch.gap.result.hypotheses import (
     verdict,
     verdict_names,
 )
+from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.parameters import ParameterPosterior, base_quantities, own_random, renamed
 from avtorch.gap.result.parts import parts_of, said_of_unnamed, unnamed_response
 from avtorch.gap.result.predictive_model import predictive_models
 from avtorch.gap.result.traces import Traces
-from avtorch.gap.result.uncounted import uncounted
 from avtorch.gap.sensor_noise import with_sensor_noise
+from avtorch.gap.simulator.effect import EFFECTS as TABLE
 from avtorch.gap.simulator.effect import Effect, chosen_effects
 from avtorch.gap.simulator.effect_response import is_observable, lookalikes, not_observable
 from avtorch.gap.simulator.plant import GapPlant, plant
-from avtorch.io import Log, LogSource, as_logs
+from avtorch.io import LogSource, as_logs
 from avtorch.io.mapping import Pairs
 
 _FORMS = {
@@ -125,22 +123,10 @@ def diagnose(
         raise InputError(f"posterior: found {posterior!r}, needs 'laplace' or 'sgld'")
     if not 0 < material < 1:
         raise InputError(f"material: found {material}, needs a share between 0 and 1")
+    beside = None
     if isinstance(baseline, BlackBoxSimulator):
         beside = baseline.beside(each, given)
-        found = diagnose(
-            beside.logs,
-            baseline=beside.plant,
-            prior=prior,
-            effects=effects,
-            pairs=pairs,
-            posterior=posterior,
-            budget_s=budget_s,
-            material=material,
-            named_only=named_only,
-            seed=seed,
-            progress=given or False,
-        )
-        return beside.told(found)
+        each, baseline = list(beside.logs), beside.plant
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = chosen_effects(effects)
     read = [with_sensor_noise(log) for log in each]
@@ -242,7 +228,7 @@ def diagnose(
     after = errors[2] if named else errors[0]
     if free is not None:
         after = rows.errors(free.lagged, free.without([]))
-    return Diagnosis(
+    answer = Diagnosis(
         log=LogFacts.of(each),
         baseline=lag_and_gain,
         gap=gap_size(
@@ -267,7 +253,7 @@ def diagnose(
         else localise(attribution, onset_s=None if onset is None else onset.from_start_s, lag=none["T_L"]),
         shrinkage=shrinkage_of(held, seed) if held is not None and back is not None else None,
         contenders=predictive_models(posteriors, said, base),
-        traces=_traces(each, rows, errors[0], after, attribution),
+        traces=Traces.of(rows, rows.measured - errors[0], rows.measured - after, attribution.does, each),
         remaining=given_dead_time(candidates, said, base),
         complete=complete,
         scope=scope,
@@ -276,6 +262,7 @@ def diagnose(
         parts=parts,
         free_form=None if free is None else free.form,
     )
+    return answer if beside is None else beside.told(answer)
 
 
 STEPS = 1000
@@ -362,24 +349,11 @@ def _scope(inference: Inference, kinds: Sequence[type[Effect]], channels: Sequen
     """What was tried: everything that promised something was, unless the time was over."""
     complete = inference.search.complete
     visited = {base_name(e) for key in inference.search.visited for e, _ in key}
-    tried = {kind.name for kind in kinds} if complete else visited
-    how = "none" if not pairs else "all" if complete else "some"
-    return Scope.of(kinds, tried | {kind.name for kind in kinds if kind.random}, channels, how)
-
-
-def _traces(
-    logs: Sequence[Log], rows: CountedRows, before: FloatArray, after: FloatArray, attribution: RowAttribution
-) -> Traces:
-    """`before`, `after` (channel, row, group): errors of the baseline and of the repaired simulator."""
-    measured = rows.measured.mean(-1)
-    return Traces(
-        time=rows.time,
-        command=rows.command,
-        channels=rows.channels,
-        measured=measured,
-        before=measured - before.mean(-1),
-        after=measured - after.mean(-1),
-        does=attribution.does,
-        stretch=rows.stretch,
-        uncounted=uncounted(logs, rows),
+    tried = {k.name for k in kinds} if complete else visited | {k.name for k in kinds if k.random}
+    own = {e.name: e for e in kinds}
+    names = [n for n, e in {**own, **TABLE, **own}.items() if is_observable(e, channels)]
+    return Scope(
+        tuple(n for n in names if n in tried),
+        tuple(n for n in names if n not in tried),
+        "none" if not pairs else "all" if complete else "some",
     )

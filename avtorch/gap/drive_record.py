@@ -50,27 +50,24 @@ class Cut(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
-    """Drives at the log's own rate, and the positions of the counted rows in one array of rows averaged to `dt` [s].
+class MeasuredRows:
+    """Rows as measured, `group` of them averaged into one, and which of these count.
 
-    `accel`, `speed` (row, group): measured, all drives' rows concatenated; None: not in the log. `time` (row,) [s] from
-    the start of its log; `stamp` (row,) [s] on that log's own clock, `log` (row,) its number; `command` (row,), mean of
-    a group. `source`: index of every counted row in these arrays; `stretch` (counted,) numbers the stretches. `group`:
-    rows averaged into one. `cuts` are the origins of the drives; drives of one segment share a road, and `position`
-    continues along it.
+    `time` (row,) [s] from the start of its log, `stamp` (row,) [s] on that log's own clock, `log` (row,) its number;
+    `command` (row,) [m/s²]; `accel` [m/s²], `speed` [m/s] (row, group) as measured, None where not in the log.
+    `source` (counted,): places of the counted rows; `stretch` (counted,) numbers the stretches without gaps. `dt` [s]
+    of an averaged row.
     """
 
-    drives: tuple[SimulatorInput, ...]
-    cuts: tuple[Cut, ...]
     time: Float[FloatArray, " row"]
     stamp: Float[FloatArray, " row"]
     log: Int[IntArray, " row"]
+    command: Float[FloatArray, " row"]
     accel: Float[FloatArray, "row group"] | None
     speed: Float[FloatArray, "row group"] | None
-    command: Float[FloatArray, " row"]
-    dt: float
     source: Int[IntArray, " counted"]
     stretch: Int[IntArray, " counted"]
+    dt: float
     group: int
 
     @property
@@ -87,32 +84,35 @@ class Record:
         """Index of each stretch's first counted row."""
         return np.flatnonzero(np.diff(self.stretch, prepend=-1))
 
+    @cached_property
+    def measured(self) -> Float[FloatArray, "channel counted group"]:
+        """Measurements of the channels, (channel, counted, group)."""
+        return np.stack([x[self.source] for x in (self.accel, self.speed) if x is not None])
+
+
+@dataclass(frozen=True, eq=False)
+class Record(MeasuredRows):
+    """Drives at the log's own rate. `cuts` are their origins; drives of one segment share a road, and `position`
+    continues along it."""
+
+    drives: tuple[SimulatorInput, ...]
+    cuts: tuple[Cut, ...]
+
     @classmethod
     def of(cls, logs: Log | Iterable[Log]) -> Record:
         """The record of one or several logs of one car. Raises `InputError` where nothing usable is left."""
         each = [logs] if isinstance(logs, Log) else list(logs)
-        if not each:
-            raise InputError("logs: none given, needs one or more")
+        same_kind(each)
         drives: list[SimulatorInput] = []
         cuts: list[Cut] = []
         columns: dict[str, list[FloatArray]] = defaultdict(list)
         names = list(dict.fromkeys(log.name for log in each))
-        if len({(log.accel is not None, log.speed is not None) for log in each}) > 1:
-            raise InputError(f"logs: {', '.join(names)} have different channels; needs accel, speed or both in all")
-        kinds = {log.accel_kind for log in each}
-        if len(kinds) > 1:
-            raise InputError(f"logs: {', '.join(names)} have different kinds of accel; needs one in all")
-        specific = "specific-force" in kinds
-        rates = [log.rate_hz for log in each]
-        if max(rates) > 1.02 * min(rates):
-            given = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in each)
-            raise InputError(f"logs: found rates of {given}; needs one rate in all, or one diagnosis each")
-        group = grouped(min(rates), RATE_HZ)
+        specific = each[0].accel_kind == "specific-force"
+        group = grouped(min(log.rate_hz for log in each), RATE_HZ)
         steps = []
         segments = 0
         for number, log in enumerate(each):
-            if log.accel_cmd is None:
-                raise no_command(log, ", which the diagnosis needs")
+            assert log.accel_cmd is not None
             first_segment = segments - int(log.segment[0])
             segments = first_segment + int(log.segment[-1]) + 1
             for cut in rolled(log, group):
@@ -131,8 +131,11 @@ class Record:
                 steps.append(step)
                 first = max(1, round(0.3 / step))
                 accel0 = None if log.accel is None else float(mean(log.accel)[:first].mean())
-                raw = log.speed if log.speed is None else log.speed[cut]
-                drives.append(_drive(log.elapsed[cut], log.accel_cmd[cut], raw, accel0, specific, position0))
+                own = torch.as_tensor(_even(log.elapsed[cut])), torch.as_tensor(log.accel_cmd[cut])
+                quiet = None
+                if log.speed is not None:
+                    quiet = torch.as_tensor(_quiet(log.speed[cut], float(np.median(np.diff(log.elapsed[cut])))))
+                drives.append(SimulatorInput(*own, quiet, accel0, specific, position0))
                 of_rows = {"time": time, "stamp": log.time[cut][::group], "log": np.full(rows, number)}
                 of_rows |= {"command": mean(log.accel_cmd), "use": (use & settled).astype(float)}
                 measured = {"accel": log.accel, "speed": log.speed}
@@ -173,10 +176,23 @@ class Record:
         whole = torch.cat([x.unflatten(-1, (-1, self.group)) for x in responses], -2)
         return whole.numpy()[..., self.source, :]
 
-    @cached_property
-    def measured(self) -> Float[FloatArray, "channel counted group"]:
-        """Measurements of the channels, (channel, counted, group)."""
-        return np.stack([x[self.source] for x in (self.accel, self.speed) if x is not None])
+
+def same_kind(logs: Sequence[Log]) -> None:
+    """Raises `InputError` for logs without `accel_cmd`, or with different channels, rates or kinds of `accel`."""
+    if not logs:
+        raise InputError("logs: none given, needs one or more")
+    names = ", ".join(dict.fromkeys(log.name for log in logs))
+    for log in logs:
+        if log.accel_cmd is None:
+            raise no_command(log, ", which the diagnosis needs")
+    if len({(log.accel is not None, log.speed is not None) for log in logs}) > 1:
+        raise InputError(f"logs: {names} have different channels; needs accel, speed or both in all")
+    if len({log.accel_kind for log in logs}) > 1:
+        raise InputError(f"logs: {names} have different kinds of accel; needs one in all")
+    rates = [log.rate_hz for log in logs]
+    if max(rates) > 1.02 * min(rates):
+        given = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in logs)
+        raise InputError(f"logs: found rates of {given}; needs one rate in all, or one diagnosis each")
 
 
 def grouped(rate: float, least: float) -> int:
@@ -193,18 +209,6 @@ def rolled(log: Log, group: int) -> Iterator[slice]:
         rows = (part.stop - part.start) // group
         if rows >= 2 * RATE_HZ:
             yield slice(part.start, part.start + rows * group)
-
-
-def _drive(
-    time: FloatArray,
-    command: FloatArray,
-    speed: FloatArray | None,
-    accel0: float | None,
-    specific: bool,
-    position0: float,
-) -> SimulatorInput:
-    quiet = None if speed is None else torch.as_tensor(_quiet(speed, float(np.median(np.diff(time)))))
-    return SimulatorInput(torch.as_tensor(_even(time)), torch.as_tensor(command), quiet, accel0, specific, position0)
 
 
 def _position(log: Log, drives: Sequence[SimulatorInput], cuts: Sequence[Cut], begun: Cut) -> float:

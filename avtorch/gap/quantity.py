@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
 import numpy as np
 from torch import Tensor
 
+from avtorch.arrays import FloatArray
 from avtorch.display import Frame
 from avtorch.errors import InputError
-
-_NORMAL_Q95 = 1.6448536269514722
 
 _UNITS = {
     "_mps2": "m/s²",
@@ -54,9 +53,11 @@ class Quantity:
         return cls(float(x.mean()), float(x.std(ddof=1)) if len(x) > 1 else 0.0, float(q05), float(q95))
 
     @classmethod
-    def of_normal(cls, mean: float, sd: float) -> Quantity:
-        """The quantity of a normal distribution."""
-        return cls(float(mean), float(sd), mean - _NORMAL_Q95 * sd, mean + _NORMAL_Q95 * sd)
+    def of_resampled(cls, value: float, draws: FloatArray) -> Quantity:
+        """A `value` with the interval of `draws` (draw,) under resampled blocks (Efron and Tibshirani 1993), widened to
+        hold it."""
+        q05, q95 = np.quantile(draws, (0.05, 0.95))
+        return cls(float(value), float(draws.std()), float(min(q05, value)), float(max(q95, value)))
 
     @classmethod
     def of_logarithm(cls, mean: float, variance: float, sure: float) -> Quantity:
@@ -70,7 +71,27 @@ class Quantity:
 
     def to_dict(self) -> dict[str, float]:
         """The quantity as JSON: mean, sd, q05, q95."""
-        return asdict(self)
+        return of_fields(self)
+
+
+def plain(x: Any) -> Any:
+    """As JSON has it: objects by their `to_dict`, or else by their fields; tuples as lists."""
+    if hasattr(x, "to_dict"):
+        return x.to_dict()
+    if is_dataclass(x):
+        return of_fields(x)
+    if isinstance(x, Mapping):
+        return {key: plain(value) for key, value in x.items()}
+    return [plain(value) for value in x] if isinstance(x, tuple | list) else x
+
+
+def of_fields(x: Any, *, intervals: bool = False) -> dict[str, Any]:
+    """The fields of a dataclass as JSON; quantities as `intervals`, without their standard deviation."""
+    out = {f.name: plain(getattr(x, f.name)) for f in fields(x)}
+    for value in out.values() if intervals else ():
+        if isinstance(value, dict):
+            value.pop("sd", None)
+    return out
 
 
 def frame_of(quantities: Mapping[str, Quantity]) -> Frame:

@@ -14,36 +14,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 from scipy.signal import lfilter
 
-from avtorch.arrays import FloatArray, IntArray
-from avtorch.gap.drive_record import Record
+from avtorch.arrays import FloatArray
+from avtorch.gap.drive_record import MeasuredRows, Record
 from avtorch.gap.simulator.plant import GapPlant
 
 HORIZON_S = 10.0
 """Of both channels: over a whole drive the speed of any model's rollout drifts away."""
 
 
-class Counted(Protocol):
-    """Rows averaged in groups, those that count in stretches without gaps; see `Record` and `CountedRows`."""
-
-    @property
-    def dt(self) -> float: ...
-    @property
-    def group(self) -> int: ...
-    @property
-    def starts(self) -> IntArray: ...
-    @property
-    def rows(self) -> int: ...
-    @property
-    def channels(self) -> tuple[str, ...]: ...
-
-
 def block_squares(
-    record: Counted, errors: FloatArray, blocks: Sequence[slice], lag: float, horizon: float
+    record: MeasuredRows, errors: FloatArray, blocks: Sequence[slice], lag: float, horizon: float
 ) -> dict[str, FloatArray]:
     """Squared rollout errors of each block (block,), by metric, of a long rollout's `errors` (channel, counted, group).
 
@@ -92,7 +76,7 @@ def _window(x: FloatArray, length: int, keeps: float) -> FloatArray:
     return total
 
 
-def rms(record: Counted, errors: FloatArray, lag: float) -> dict[str, float]:
+def rms(record: MeasuredRows, errors: FloatArray, lag: float) -> dict[str, float]:
     """Root mean square by channel of a long rollout's `errors` (channel, counted, group) in rollouts of `HORIZON_S`,
     over all counted rows; `lag` [s]."""
     edges = [*record.starts.tolist(), record.rows]
@@ -104,7 +88,7 @@ def rms(record: Counted, errors: FloatArray, lag: float) -> dict[str, float]:
     }
 
 
-def reached(record: Counted, horizon: float) -> float:
+def reached(record: MeasuredRows, horizon: float) -> float:
     """Longest rollouts [s] of up to `horizon` [s] that the stretches hold."""
     longest = int(np.diff([*record.starts.tolist(), record.rows]).max()) * record.dt
     return min(horizon, longest)

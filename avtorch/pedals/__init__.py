@@ -8,7 +8,7 @@ Example:
     >>> throttle = 0.3 + 0.2 * np.sin(0.5 * time)
     >>> speed = 15.0 + 1.2 * np.sin(0.5 * time - np.pi / 2)  # its slope is three times what is beyond 0.3
     >>> log = Log.from_arrays(time=time, throttle=throttle, speed=speed)
-    >>> commanded = fit_pedals(log).map.commanded(log)  # what estimate, diagnose and gap_budget take
+    >>> commanded = fit_pedals(log).map.commanded(log)  # what estimate and diagnose take
     >>> bool(np.ptp(commanded.accel_cmd) > 1.0)
     True
 """

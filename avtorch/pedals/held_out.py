@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.answer.budget import HORIZON_S
+from avtorch.gap.result.budget import HORIZON_S
 from avtorch.gap.result.free_form import Fit, LeftOut, Prior, Products, Sizes, drive
 
 

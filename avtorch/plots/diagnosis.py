@@ -15,10 +15,10 @@ from matplotlib.ticker import PercentFormatter
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
-from avtorch.gap.answer.budget import HORIZON_S, LIKELY, Budget, percent
-from avtorch.gap.answer.location import UNITS, Axis
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.diagnosis import Candidate, Diagnosis
+from avtorch.gap.result.budget import HORIZON_S, LIKELY, UNITS, Axis, Budget, percent
+from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.hypotheses import Candidate
 from avtorch.gap.result.traces import Traces
 from avtorch.io.clock import time_label
 from avtorch.plots.style import (

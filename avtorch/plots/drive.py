@@ -17,12 +17,10 @@ from matplotlib.ticker import NullLocator
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.experiment import Experiment
-from avtorch.gap.result.alarm import Alarm
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.manoeuvres import Manoeuvre
 from avtorch.gap.result.residuals import Residuals
-from avtorch.gap.result.traces import Traces
-from avtorch.gap.result.uncounted import Reason, Uncounted
+from avtorch.gap.result.traces import Alarm, Reason, Traces, Uncounted
 from avtorch.plots.diagnosis import budget_bars, traces_of
 from avtorch.plots.style import (
     BLACK,

@@ -66,9 +66,8 @@ class Trial:
     @property
     def traces(self) -> Traces:
         """What was measured."""
-        record, measured = self.record, self.record.measured.mean(-1)
-        rows = record.time[record.source], record.command[record.source], record.channels
-        return Traces(*rows, measured, measured, measured, np.zeros(record.rows), record.stretch)
+        measured = self.record.measured
+        return Traces.of(self.record, measured, measured, np.zeros(self.record.rows))
 
     def sizes(self, car: GapPlant) -> dict[str, Size]:
         """What can be moved, by the names of `GapPlant.parameters`."""

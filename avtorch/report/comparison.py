@@ -14,8 +14,7 @@ from avtorch.report.table import Table
 
 if TYPE_CHECKING:
     from avtorch.external import SimulatorComparison
-    from avtorch.gap.answer.change import ChangeCause
-    from avtorch.gap.result.comparison import Comparison
+    from avtorch.gap.result.comparison import ChangeCause, Comparison
     from avtorch.gap.result.log_facts import LogFacts
 
 _ROWS = {
@@ -91,7 +90,7 @@ def _cause_table(cause: ChangeCause | None) -> Table | None:
     if cause is None:
         return None
     if not cause.parts:
-        from avtorch.gap.answer.change import detectable_text
+        from avtorch.gap.result.comparison import detectable_text
 
         least = tuple((name, detectable_text(name, x)) for name, x in cause.detectable.items())
         return Table("What would show", ("least change that would show", "size"), least) if least else None

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from avtorch.gap.answer.budget import percent as share_of
 from avtorch.gap.quantity import unit_of, words_of
 from avtorch.gap.result import sentences
+from avtorch.gap.result.budget import percent as share_of
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.manoeuvres import Manoeuvre, manoeuvres
 from avtorch.report.diagnosis_tables import budget_table, candidate_table, measure_table

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avtorch.experiment import Experiment
-from avtorch.gap.answer.budget import percent as share_of
-from avtorch.gap.answer.location import UNITS, Axis
 from avtorch.gap.result import sentences
+from avtorch.gap.result.budget import UNITS, Axis
+from avtorch.gap.result.budget import percent as share_of
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.manoeuvres import Manoeuvre, manoeuvres
 from avtorch.plots import diagnosis as drawings
@@ -22,7 +22,6 @@ from avtorch.report.diagnosis_tables import (
     candidate_table,
     family_table,
     measure_table,
-    percent,
     place_table,
     setting_table,
 )
@@ -104,7 +103,6 @@ def report_html(
                 (_held_out(found),),
                 _one(curves),
                 tables=() if curves is not None else (measures,),
-                soft=_placebo(found),
             ),
             _setting(found),
             Section(
@@ -386,14 +384,6 @@ def _held_out(found: Diagnosis) -> str:
         f"Cross-validated on {scores.blocks} blocks of the drives: each is scored by a simulator selected and fitted "
         f"on {others} alone."
     )
-
-
-def _placebo(found: Diagnosis) -> tuple[str, ...]:
-    scores = found.shrinkage
-    if scores is None or scores.placebo is None or scores.placebo_effect is None:
-        return ()
-    wrong = f"{scores.placebo_effect}, a wrong effect added to the verdict"
-    return (f"A placebo ({wrong}) closes {percent(scores.placebo)}.",)
 
 
 # what to do --------------------------------------------------------------------------------------------------------

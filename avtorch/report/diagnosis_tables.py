@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from avtorch.gap.answer import budget as budget_parts
-from avtorch.gap.answer.budget import Budget
-from avtorch.gap.answer.location import UNITS
 from avtorch.gap.engine.family import FORMS
-from avtorch.gap.quantity import unit_of, words_of
+from avtorch.gap.quantity import Quantity, unit_of, words_of
+from avtorch.gap.result import budget as budget_parts
 from avtorch.gap.result import sentences
-from avtorch.gap.result.diagnosis import Diagnosis, Quantity, Shrinkage
+from avtorch.gap.result.budget import UNITS, Budget
+from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.gap_budget import Shrinkage
 from avtorch.report.table import Table
 
 _METRICS = {

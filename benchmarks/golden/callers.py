@@ -17,13 +17,12 @@ from avtorch.experiment import next_experiment
 from avtorch.external import FmuSimulator, wrap, write_fmu
 from avtorch.fleet import FleetSettings, run_fleet
 from avtorch.follower import diagnose_follower
-from avtorch.gap import gap_budget, plant
+from avtorch.gap import plant
 from avtorch.io import read_following
 from avtorch.pedals import fit_pedals
 from benchmarks.golden import cars
 from benchmarks.golden.facts import (
     Answer,
-    budget_facts,
     comparison_facts,
     diagnosis_facts,
     tested_facts,
@@ -88,12 +87,6 @@ def own_plant() -> Answer:
     """The user's simulator as a plant of effects, which has the delay already."""
     log = cars.drive("late and dragged", {**cars.LATE, **cars.DRAGGED}, seed=6)
     return of(cars.DRAGGED) | diagnosed(log, baseline="dead_time=0.25")
-
-
-def budget() -> Answer:
-    log = cars.drive("late and tilted", {**cars.LATE, **cars.TILTED}, seed=7)
-    found, took = timed(lambda: gap_budget(log, progress=False))
-    return of({**cars.LATE, **cars.TILTED}) | budget_facts(found) | took
 
 
 def by_output() -> Answer:
@@ -278,7 +271,6 @@ CALLERS: dict[str, Callable[[], Answer]] = {
     "diagnose, three effects, no pairs": chosen_effects,
     "diagnose, sgld": sampled,
     "diagnose, own plant": own_plant,
-    "gap_budget": budget,
     "simulator by output": by_output,
     "simulator called": called,
     "simulator adjusted": adjusted,

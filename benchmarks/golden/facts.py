@@ -43,12 +43,6 @@ def diagnosis_facts(answer: Mapping[str, Any]) -> Answer:
     return facts | _budget(answer.get("budget"), parameters)
 
 
-def budget_facts(found: Any) -> Answer:
-    """Of a `Budget`."""
-    facts: Answer = {"verdict": list(found.verdict), "partial": bool(found.partial)}
-    return facts | _budget(found.to_dict(), {})
-
-
 def _budget(budget: Mapping[str, Any] | None, parameters: Answer) -> Answer:
     if budget is None:
         return {"parameters": parameters, "budget": None}

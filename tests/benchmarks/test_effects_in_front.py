@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from avtorch.gap import Budget, ChancePart, Part, Unexplained
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.budget import Budget, ChancePart, Part, Unexplained
 from benchmarks.budget_cells import causes, counted
 from benchmarks.effects_in_front import HEADER, InFront, Size, closing, compared
 

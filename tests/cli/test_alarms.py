@@ -12,7 +12,7 @@ import pytest
 from avtorch import Log
 from avtorch.cli.alarms import read_alarms
 from avtorch.errors import InputError
-from avtorch.gap.result.alarm import Alarm
+from avtorch.gap.result.traces import Alarm
 
 TIME = 1000.0 + 0.05 * np.arange(200)
 LOG = Log.from_arrays(name="drive.csv", time=TIME, accel_cmd=np.sin(TIME), speed=10 + np.cos(TIME))

@@ -21,7 +21,11 @@ from avtorch.cli.follower import print_diagnosis
 from avtorch.cli.talk import Talk, drawn
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, DeadTime, GapPlant, plant
-from avtorch.gap.result.diagnosis import Candidate, Diagnosis, GapSize, LogFacts, Quantity
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.gap_size import GapSize
+from avtorch.gap.result.hypotheses import Candidate
+from avtorch.gap.result.log_facts import LogFacts
 from avtorch.io import Log, read_answer
 from avtorch.report.diagnosis_tables import candidate_table
 from tests.gap.verdicts import near, verdict_of
@@ -30,7 +34,7 @@ ROWS = 600
 
 
 def around(mean: float, sd: float) -> Quantity:
-    return Quantity.of_normal(mean, sd)
+    return Quantity(mean, sd, mean - 1.645 * sd, mean + 1.645 * sd)
 
 
 BASELINE = {"T_L": around(0.52, 0.01), "K_L": around(1.02, 0.01)}

@@ -14,7 +14,6 @@ from avtorch.display import progress, progress_bar, show
 from avtorch.experiment import next_experiment
 from avtorch.fleet import run_fleet
 from avtorch.follower import diagnose_follower
-from avtorch.gap import gap_budget
 from avtorch.paper import reproduce
 
 
@@ -128,7 +127,6 @@ def test_a_diagnosis_tells_the_stages_of_the_whole(outputs: list[Output]) -> Non
         avtorch.estimate,
         avtorch.validate,
         diagnose_follower,
-        gap_budget,
         next_experiment,
         reproduce,
         run_fleet,

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from avtorch.errors import InputError
 from avtorch.experiment import Limits, library
 from avtorch.gap import DeadTime, GapPlant, SecondOrderActuator, SensorLag, SimulatorInput, plant
-from avtorch.gap.result.diagnosis import LogFacts
+from avtorch.gap.result.log_facts import LogFacts
 from avtorch.io import Log
 from tests.gap.records import log_of
 

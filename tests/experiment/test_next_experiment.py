@@ -18,8 +18,10 @@ from avtorch.gap.effects import AerodynamicDrag, ConstantResistance, DeadBand, G
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance
-from avtorch.gap.result.diagnosis import Diagnosis, GapSize, LogFacts
+from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.gap_size import GapSize
 from avtorch.gap.result.hypotheses import Candidate
+from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.predictive_model import NoiseSpectrum, PredictiveModel
 from avtorch.gap.result.sentences import to_drive
 from tests.bars import BAR

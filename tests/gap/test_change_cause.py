@@ -14,14 +14,13 @@ from scipy.stats import binom
 import avtorch
 from avtorch.errors import InputError
 from avtorch.gap import ConstantResistance, DeadTime, Effect, SensorBias, plant
-from avtorch.gap.answer.change import ChangeCause, ChangePart, detectable_text
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.joint import JointModel, block_scores, of_car
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.cause_of_change import cause_of_change
-from avtorch.gap.result.comparison import Comparison
-from avtorch.gap.result.diagnosis import LogFacts
+from avtorch.gap.result.comparison import ChangeCause, ChangePart, Comparison, detectable_text
+from avtorch.gap.result.log_facts import LogFacts
 from avtorch.io import Log
 from avtorch.report import comparison_html
 from avtorch.report.comparison import comparison_tables

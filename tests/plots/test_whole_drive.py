@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from avtorch.errors import InputError
-from avtorch.gap.result.alarm import Alarm
-from avtorch.gap.result.traces import Traces
-from avtorch.gap.result.uncounted import Uncounted
+from avtorch.gap.result.traces import Alarm, Traces, Uncounted
 from avtorch.plots.drive import drive_figure, drive_time, envelope
 
 STEP = 0.05

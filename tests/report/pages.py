@@ -11,9 +11,8 @@ import numpy as np
 
 import avtorch
 from avtorch.external.simulator_comparison import Difference, ErrorsOfTwo, SimulatorComparison
-from avtorch.gap.answer.change import ChangeCause, ChangePart
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.comparison import Change, Comparison
+from avtorch.gap.result.comparison import Change, ChangeCause, ChangePart, Comparison
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.inference import SamplerSettings
 from avtorch.report import Origin, comparison_html, estimates_html, run_html, validation_html

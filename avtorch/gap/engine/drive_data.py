@@ -22,11 +22,11 @@ from scipy.signal import lfilter
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
+from avtorch.gap.drive_record import same_kind
 from avtorch.gap.engine.compiled_plant import GRID_S
 from avtorch.gap.engine.priors import BAND_RATIO, CLAIM_HZ, FRAME_S, WARM_S
 from avtorch.io import Log
 from avtorch.io.log import AccelKind
-from avtorch.io.no_command import no_command
 
 _MOST_HZ = 100.0  # rows of faster logs are averaged: nothing above half of it is a car's
 _SMOOTH_S = 0.3  # the speed enters effects smoothed over it
@@ -116,7 +116,7 @@ class DriveData:
         no stretch of driving is long enough for two frames.
         """
         each = [logs] if isinstance(logs, Log) else list(logs)
-        _same_kind(each)
+        same_kind(each)
         rate = min(log.rate_hz for log in each)
         group = max(1, int(1.02 * rate / _MOST_HZ))
         columns: dict[str, list[FloatArray]] = {
@@ -439,23 +439,6 @@ class DriveData:
             return float(self.accel[row : row + w].mean())
         v, t = self.smooth_speed, self.time
         return float((v[row + w] - v[row]) / (t[row + w] - t[row]))
-
-
-def _same_kind(logs: Sequence[Log]) -> None:
-    if not logs:
-        raise InputError("logs: none given, needs one or more")
-    names = ", ".join(dict.fromkeys(log.name for log in logs))
-    for log in logs:
-        if log.accel_cmd is None:
-            raise no_command(log, ", which the diagnosis needs")
-    if len({(log.accel is not None, log.speed is not None) for log in logs}) > 1:
-        raise InputError(f"logs: {names} have different channels; needs accel, speed or both in all")
-    if len({log.accel_kind for log in logs}) > 1:
-        raise InputError(f"logs: {names} have different kinds of accel; needs one in all")
-    rates = [log.rate_hz for log in logs]
-    if max(rates) > 1.02 * min(rates):
-        given = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in logs)
-        raise InputError(f"logs: found rates of {given}; needs one rate in all, or one diagnosis each")
 
 
 def _stretches(log: Log) -> list[slice]:

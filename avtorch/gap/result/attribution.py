@@ -16,13 +16,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.signal import lfilter
+from scipy.stats import false_discovery_control
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.answer.location import Axis, Location
-from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name
+from avtorch.gap.engine.coordinates import base_name
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import EFFECT_NATS
+from avtorch.gap.result.budget import Axis, Location
 from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
@@ -91,14 +92,11 @@ def _squares(h: Hypothesis, x: FloatArray) -> FloatArray:
 
 def _without_sensor(h: Hypothesis) -> FloatArray | None:
     """The prediction without the sensor's effects; None where there are none."""
-    own = [e for e in h.effects if base_name(e) in TABLE and TABLE[base_name(e)].place == "sensor"]
-    if not own:
-        return None
-    values = h.values.copy()
-    for e in own:
-        for c in EFFECTS[e].coordinates:
-            values[INDEX[c.name]] = h.neutral[INDEX[c.name]]
-    return h.response(values)
+    rest = h
+    for e in h.effects:
+        if base_name(e) in TABLE and TABLE[base_name(e)].place == "sensor":
+            rest = rest.without(e)
+    return None if rest is h else rest.response()
 
 
 def localise(attribution: RowAttribution, *, onset_s: float | None, lag: float) -> tuple[Location, ...]:
@@ -208,13 +206,5 @@ def _band(attribution: RowAttribution) -> Iterator[Part]:
 
 
 def _q_values(gains: Sequence[float]) -> list[float]:
-    """q-values from e-values, given by their logarithms."""
-    if not gains:
-        return []
-    order = np.argsort(-np.asarray(gains))
-    rank = np.arange(1, len(gains) + 1)
-    q = np.minimum(1.0, len(gains) / rank * np.exp(-np.clip(np.asarray(gains)[order], -50.0, 700.0)))
-    q = np.minimum.accumulate(q[::-1])[::-1]
-    out = np.empty(len(gains))
-    out[order] = q
-    return out.tolist()
+    """q-values from e-values, given by their logarithms: Benjamini and Hochberg's of their inverses."""
+    return false_discovery_control(np.exp(-np.clip(gains, 0.0, 700.0))).tolist() if gains else []

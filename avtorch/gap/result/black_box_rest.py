@@ -23,7 +23,7 @@ from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.free_forms import band_products
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.result.free_runs import Blocks, compared, readings
+from avtorch.gap.result.free_runs import Blocks, compared, readings, speed_gained
 
 _LAGS_S = (0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
 _SMOOTH_S = 0.5  # of the speed: little of the noise of the moment is in it
@@ -177,10 +177,8 @@ def _shown(h: Hypothesis, place: int, x: FloatArray) -> FloatArray:
         out = np.zeros((2, len(x)))
         out[0 if place == _ACCEL else 1] = x
         return out
-    grid = h.data.grid
-    step = np.where(grid.starts, 0.0, np.diff(grid.time, prepend=grid.time[:1]))
-    acts = x[grid.row]
-    return readings(h, acts, np.cumsum(step * np.concatenate([acts[:1], acts[:-1]])))
+    acts = x[h.data.grid.row]
+    return readings(h, acts, speed_gained(h.data.grid, acts))
 
 
 # columns -------------------------------------------------------------------------------------------------------------

@@ -10,8 +10,6 @@ import torch
 from scipy.stats import t as student
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.answer.budget import LIKELY
-from avtorch.gap.answer.change import Answer, ChangeCause, ChangePart, detectable_text
 from avtorch.gap.engine.car import table_effect
 from avtorch.gap.engine.changes import (
     ChangePosterior,
@@ -25,7 +23,8 @@ from avtorch.gap.engine.coordinates import adopt
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.joint import Change, JointFit, JointModel, of_car
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.comparison import DeadTimeTest
+from avtorch.gap.result.budget import LIKELY
+from avtorch.gap.result.comparison import Answer, ChangeCause, ChangePart, DeadTimeTest, detectable_text
 from avtorch.gap.simulator.effect import Effect
 
 _ERRORS = 4.0  # 2.6 standard errors are as likely as not, and 1.4 more have them in nine of ten drives

@@ -1,23 +1,84 @@
-"""The result of comparing two sets of drives."""
+"""What comparing two sets of drives finds: what has changed, by how much, or that these drives do not show it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from math import isfinite
 from typing import TYPE_CHECKING, Any, Literal
 
 from avtorch.display import Card, Displayed, Frame
-from avtorch.gap.answer.change import ChangeCause
-from avtorch.gap.quantity import Quantity, unit_of
-from avtorch.gap.result.diagnosis import LogFacts
+from avtorch.gap.quantity import Quantity, of_fields, plain, unit_of, words_of
+from avtorch.gap.result.log_facts import LogFacts
 
 if TYPE_CHECKING:
     import pandas
 
+Answer = Literal["named", "ambiguous", "unknown", "drift", "none"]
 SimulatorChange = Literal["closer", "farther", "inconclusive"]
 Explanation = Literal["lag and gain", "not lag and gain", "not distinguishable"]
 
 _SURE = 0.75  # three to one: the probability from which on an explanation stands
+
+
+@dataclass(frozen=True)
+class ChangePart:
+    """One thing that has changed: `name` is T_L, K_L or an effect; `parameters` the change itself.
+
+    `alias_set`: what held-out blocks cannot distinguish from it, itself among them. `less`: an effect that the drives
+    before have more of.
+    """
+
+    name: str
+    alias_set: tuple[str, ...]
+    probability: float
+    parameters: Mapping[str, Quantity]
+    less: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        out = of_fields(self)
+        return {"names": [out.pop("name")]} | out
+
+    def __str__(self) -> str:
+        name = f"less {self.name}" if self.less else self.name
+        sizes = ", ".join(_text(key, q) for key, q in self.parameters.items() if is_change(key))
+        return f"{name} ({sizes})" if sizes else name
+
+
+@dataclass(frozen=True)
+class ChangeCause:
+    """What has changed: `parts`, the first found first.
+
+    `answer`: `"named"`; `"ambiguous"` where a part has aliases; `"unknown"` where something reproducible has changed
+    that no effect explains; `"drift"` where a change is supported, but halves of one side differ by as much; `"none"`,
+    also where a change is supported whose size is too uncertain. `detectable`: the least change of T_L and K_L (as a
+    share) and of dead time [s] that these drives show, infinite (in JSON null) where they show none. `why`: one or two
+    sentences.
+    """
+
+    parts: tuple[ChangePart, ...]
+    answer: Answer
+    detectable: Mapping[str, float]
+    why: str
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(part.name for part in self.parts)
+
+    @property
+    def probability(self) -> float | None:
+        """That other drives of the two cars would name the least certain part again; None without parts."""
+        return min((part.probability for part in self.parts), default=None)
+
+    def to_dict(self) -> dict[str, Any]:
+        each = {f"{part.name}.{key}": q for part in self.parts for key, q in part.parameters.items()}
+        return of_fields(self) | {
+            "names": list(self.names),
+            "alias_set": list(dict.fromkeys(name for part in self.parts for name in part.alias_set)),
+            "probability": self.probability,
+            "parameters": plain(each),
+            "detectable": {name: value if isfinite(value) else None for name, value in self.detectable.items()},
+        }
 
 
 @dataclass(frozen=True)
@@ -27,9 +88,6 @@ class Change:
     before: Quantity
     after: Quantity
     ratio: Quantity
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -56,13 +114,9 @@ class DeadTimeTest:
         return "lag and gain" if self.p_lag_gain > _SURE else "not distinguishable"
 
     def to_dict(self) -> dict[str, Any]:
-        delays = {"before": self.before, "after": self.after, "difference": self.difference}
-        return {
-            "explanation": self.explanation,
-            "p_lag_gain": self.p_lag_gain,
-            "p_dead_time": self.p_dead_time,
-            "dead_time_s": {name: q.to_dict() for name, q in delays.items()},
-        }
+        out = of_fields(self)
+        delays = {key: out.pop(key) for key in ("before", "after", "difference")}
+        return {"explanation": self.explanation, "dead_time_s": delays} | out
 
 
 @dataclass(frozen=True, repr=False)
@@ -112,17 +166,25 @@ class Comparison(Displayed):
 
     def to_dict(self) -> dict[str, Any]:
         """The object of `comparison.json`, schema `avtorch.comparison/1`."""
-        return {
-            "schema": "avtorch.comparison/1",
-            "before": self.before.to_dict(),
-            "after": self.after.to_dict(),
-            "car": {name: moved.to_dict() for name, moved in self.car.items()},
-            "gap": {name: moved.to_dict() for name, moved in self.gap.items()},
-            "horizon_s": self.horizon_s,
-            "p_value": self.p_value,
-            "changed": self.changed,
-            "explained": None if self.dead_time_test is None else self.dead_time_test.to_dict(),
-            "cause": None if self.cause is None else self.cause.to_dict(),
-            "simulator": self.simulator,
-            "why": self.why,
-        }
+        out = of_fields(self)
+        return {"schema": "avtorch.comparison/1", "explained": out.pop("dead_time_test")} | out
+
+
+def detectable_text(name: str, value: float) -> str:
+    """A least change with its unit: a share of T_L and K_L, seconds of dead time."""
+    if not isfinite(value):
+        return "none"
+    if name not in ("T_L", "K_L"):
+        return f"{value:.2g} s"
+    return f"{value:.0%}" if value > 0.02 else f"{100 * value:.1g}%"
+
+
+def is_change(key: str) -> bool:
+    """Whether a parameter of a change is its size, not what was before or after it."""
+    return not key.startswith(("before", "after"))
+
+
+def _text(key: str, q: Quantity) -> str:
+    unit = unit_of(key)
+    word = "" if key.startswith("change") else f"{words_of(key)} "
+    return f"{word}{q.mean:+.3g}{'' if unit == '-' else ' ' + unit}, 90 % {q.q05:.3g} to {q.q95:.3g}"

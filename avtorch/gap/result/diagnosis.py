@@ -2,63 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
-from avtorch.gap.answer.budget import Budget
-from avtorch.gap.answer.location import Location
-from avtorch.gap.engine.force_map import ForceMap
-from avtorch.gap.quantity import Quantity, frame_of, unit_of
+from avtorch.gap.quantity import Quantity, frame_of, plain, unit_of
 from avtorch.gap.result import sentences
-from avtorch.gap.result.alarm import Alarm
-from avtorch.gap.result.free_form import FreeForm
-from avtorch.gap.result.gap_budget import MetricShrinkage, Shrinkage
-from avtorch.gap.result.gap_size import GapSize
-from avtorch.gap.result.hypotheses import (
-    Candidate,
-    Scope,
-    Verdict,
-    candidate_name,
-    listed_candidates,
-    plain,
-    plausibility,
-)
-from avtorch.gap.result.log_facts import LogFacts
-from avtorch.gap.result.parts import AnswerPart, force_map_of
-from avtorch.gap.result.predictive_model import PredictiveModel
-from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
-from avtorch.gap.result.traces import Traces
+from avtorch.gap.result.findings import Findings
+from avtorch.gap.result.hypotheses import plausibility
 from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.inference.posterior import effective_sample_size, nested_rhat, normal_scores
-from avtorch.io import answer_set, atomic, write_json
+from avtorch.io import Log, answer_set, atomic, write_json
 
 if TYPE_CHECKING:
     import pandas
     from arviz import InferenceData
-
-__all__ = [
-    "DIAGNOSIS_FILES",
-    "Candidate",
-    "Diagnosis",
-    "GapSize",
-    "LogFacts",
-    "MetricShrinkage",
-    "Quantity",
-    "Shrinkage",
-    "Verdict",
-    "candidate_name",
-    "listed_candidates",
-]
 
 DIAGNOSIS_FILES = (
     "diagnosis.json",
@@ -77,7 +43,7 @@ DIAGNOSIS_FILES = (
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Diagnosis(Displayed):
+class Diagnosis(Displayed, Findings):
     """What the simulator lacks, according to a log; `str()` states it in a few sentences.
 
     - `candidates`: the hypotheses as `listed_candidates` orders them, whatever the order given
@@ -89,7 +55,7 @@ class Diagnosis(Displayed):
     - `where`, `shrinkage`: where the gap lies, and how far it shrinks on held-out folds; empty where there is no gap,
       None where the drives are too short to split or nothing was named
     - `budget`: what each cause contributes to the gap; None where the drives are too short to hold out blocks
-    - `parts`: the named effects, and beside them the force map of the car, a part without a name; see `force_map`
+    - `parts`: the named effects, and beside them the force map of the car, a part without a name
     - `traces`: the drives beside the rollouts of `simulator` and `plant`
     - `contenders`: predictive models of the alias set, as far as it was fitted; where held-out blocks selected effects,
       of the repaired simulator and what could take its place
@@ -116,47 +82,6 @@ class Diagnosis(Displayed):
         >>> [path.name for path in found.write("out")]
         ['diagnosis.json', 'plant.toml']
     """
-
-    log: LogFacts
-    baseline: Mapping[str, Quantity]
-    gap: GapSize
-    candidates: tuple[Candidate, ...]
-    verdict: Verdict
-    onset_s: float | None = None
-    plant: GapPlant | None = None
-    draws: Mapping[str, NDArray] | None = None
-    simulator: GapPlant | None = None
-    belief: Mapping[str, NDArray] | None = None
-    assumed: Mapping[str, NDArray] | None = None
-    traces: Traces | None = None
-    remaining: tuple[Candidate, ...] | None = None
-    where: tuple[Location, ...] = ()
-    shrinkage: Shrinkage | None = None
-    contenders: tuple[PredictiveModel, ...] = ()
-    next_experiment: Mapping[str, Any] | None = None
-    setting: Mapping[str, Any] | None = None
-    complete: bool = True
-    scope: Scope | None = None
-    notes: tuple[str, ...] = ()
-    onset_from_start_s: float | None = None
-    onset_log: int = 0
-    budget: Budget | None = None
-    tested: SimulatorUnderTest | None = None
-    alarms: tuple[Alarm, ...] = ()
-    parts: tuple[AnswerPart, ...] = ()
-    free_form: FreeForm | None = None
-
-    def __post_init__(self) -> None:
-        if self.onset_s is not None and self.onset_from_start_s is None:
-            object.__setattr__(self, "onset_from_start_s", self.onset_s - self.log.epochs_s[self.onset_log])
-        object.__setattr__(self, "candidates", listed_candidates(self.candidates))
-        named = self.verdict.name
-        if self.budget is None and self.probability(named) < self.candidates[0].probability - 1e-12:
-            raise InputError(f"verdict: found {named}, needs the most probable, {self.candidates[0].name}")
-        if self.budget is not None and candidate_name(self.budget.verdict) != named:
-            raise InputError(f"verdict: found {named}, needs that of the budget, {candidate_name(self.budget.verdict)}")
-        if named not in self.verdict.alias_set or self.verdict.abstained != (named == "unknown"):
-            raise InputError(f"verdict: found {self.verdict}, needs itself in its alias set, and to abstain on unknown")
 
     def __str__(self) -> str:
         """The sentences of the terminal, one per line."""
@@ -210,22 +135,6 @@ class Diagnosis(Displayed):
         ]
         return Frame.of_rows(rows).to_dataframe()
 
-    @property
-    def force_map(self) -> ForceMap | None:
-        """The car's force beyond K u where the evidence has it likely; `free_form` is what `plant` carries."""
-        return force_map_of(self.parts)
-
-    @property
-    def winner(self) -> Candidate:
-        """The verdict's entry among the hypotheses; where it is too improbable to be listed, one without numbers."""
-        name = self.verdict.name
-        return next((c for c in self.candidates if c.name == name), Candidate(name, 0.0))
-
-    def probability(self, names: str | Iterable[str]) -> float:
-        """Probability of a hypothesis, by name or names; 0 where it is not listed."""
-        name = candidate_name(names)
-        return next((c.probability for c in self.candidates if c.name == name), 0.0)
-
     def to_dict(self) -> dict[str, Any]:
         """The object of `diagnosis.json`, schema `avtorch.diagnosis/2`, or `/1` where there is no budget.
 
@@ -234,26 +143,16 @@ class Diagnosis(Displayed):
         `remaining`, `complete`, `not_tried` (`effects` by name; `pairs`, of which "all", "some", "none" were tried) and
         `notes`.
         """
-        return {
+        own = ("log", "budget", "baseline", "gap", "where", "onset_s", "onset_from_start_s", "parts", "shrinkage")
+        own += ("next_experiment", "setting", "remaining", "complete", "notes")
+        out = {
             "schema": f"avtorch.diagnosis/{1 if self.budget is None else 2}",
-            "log": self.log.to_dict(),
-            "budget": None if self.budget is None else self.budget.to_dict(),
-            "baseline": plain(self.baseline),
-            "gap": self.gap.to_dict(),
-            "where": [w.to_dict() for w in self.where],
-            "onset_s": self.onset_s,
-            "onset_from_start_s": self.onset_from_start_s,
-            "effects": [c.to_dict() for c in self.candidates],
-            "parts": [part.to_dict() for part in self.parts],
-            "verdict": self.verdict.to_dict() | plausibility(self.winner.implausible),
-            "shrinkage": None if self.shrinkage is None else self.shrinkage.to_dict(),
-            "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),
-            "setting": None if self.setting is None else dict(self.setting),
-            "remaining": None if self.remaining is None else [c.to_dict() for c in self.remaining],
-            "complete": self.complete,
-            "not_tried": None if self.scope is None else self.scope.to_dict(),
-            "notes": list(self.notes),
-        } | ({} if self.tested is None else {"simulator": self.tested.to_dict()})
+            "effects": self.candidates,
+            "verdict": plain(self.verdict) | plausibility(self.winner.implausible),
+            "not_tried": self.scope,
+        }
+        out |= {key: getattr(self, key) for key in own} | ({} if self.tested is None else {"simulator": self.tested})
+        return plain(out)
 
     def write(self, folder: str | PathLike[str]) -> list[Path]:
         """Write `diagnosis.json` and, where there is a plant, `plant.toml`; returns the files.
@@ -311,3 +210,20 @@ class Diagnosis(Displayed):
         units = {name: unit_of(name) for name in draws}
         attributes = {"candidate": self.verdict.name, "log": self.log.name}
         return inference_data(draws, ("chain", "draw"), units=units, attributes=attributes)
+
+
+class SimulatorBesideCar(Protocol):
+    """A car's drives and a simulator that is not made of effects: diagnosed by `logs` with `plant` as the baseline."""
+
+    @property
+    def logs(self) -> Sequence[Log]: ...
+    @property
+    def plant(self) -> GapPlant: ...
+    def told(self, found: Diagnosis) -> Diagnosis: ...
+
+
+@runtime_checkable
+class BlackBoxSimulator(Protocol):
+    """A simulator that is not made of effects; `avtorch.external.ExternalSimulator` is one."""
+
+    def beside(self, logs: Sequence[Log], progress: Callable[[str, int, int], None] | None) -> SimulatorBesideCar: ...

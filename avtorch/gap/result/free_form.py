@@ -27,13 +27,13 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.signal import lfilter
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
-from avtorch.gap.answer.budget import HORIZON_S
 from avtorch.gap.engine.car import plant_of
 from avtorch.gap.engine.force_map import ForceMap
 from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.priors import MAP_SIZE
 from avtorch.gap.engine.sample import sample
+from avtorch.gap.result.budget import HORIZON_S
 from avtorch.gap.result.output_error import SETTLED_S, STEP_S, Coefficients, Rows, Runs
 from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.force_table import ForceTable, ResistanceCurve

@@ -15,10 +15,9 @@ from itertools import pairwise
 import numpy as np
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
-from avtorch.gap.answer.budget import BEGIN_S, HORIZON_S
-from avtorch.gap.engine.compiled_plant import read_late
-from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.drive_data import DriveData, Grid
 from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.result.budget import BEGIN_S, HORIZON_S
 
 FOLDS = 5
 FEWEST = 5
@@ -33,13 +32,6 @@ class Blocks:
     """Blocks of rows, in order, and the `fold` (block,) that holds each out. Of frames: the block (frame,) of their
     first hop, and the folds' masks `taught` (fold, frame). `by_drives`: folds are whole drives.
 
-    Example:
-        >>> from avtorch import Leader, simulate
-        >>> from avtorch.gap.engine.drive_data import DriveData
-        >>> log = simulate(Leader.default(start=30.0, duration=120.0, dt=0.05)).log()
-        >>> blocks = Blocks.of(DriveData.of(log))
-        >>> len(blocks.rows), blocks.taught.shape[0], blocks.by_drives
-        (9, 5, False)
     """
 
     rows: tuple[slice, ...]
@@ -81,7 +73,7 @@ class Blocks:
         """Sums (..., block) over each block's rows of `x` (..., row)."""
         return np.stack([x[..., rows].sum(-1) for rows in self.rows], -1)
 
-    def stitched(self, of_folds: Sequence[FloatArray]) -> FloatArray:
+    def stitched(self, of_folds: Sequence[FloatArray] | FloatArray) -> FloatArray:
         """(channel, row): each block's by the fit that was made without it; 0 outside."""
         out = np.zeros_like(of_folds[0])
         for rows, k in zip(self.rows, self.fold, strict=True):
@@ -106,16 +98,13 @@ class Blocks:
 
 def readings(h: Hypothesis, accel: FloatArray, gained: FloatArray) -> FloatArray:
     """Grid signals as the recorder shows them: (channel, row) of acceleration [m/s²] and speed gained [m/s]."""
-    data, grid, out = h.data, h.data.grid, []
-    if data.accel is not None:
-        a = np.empty(len(data.time))
-        read_late(data.time, grid.time, accel, h["accel_delay"], a)
-        out.append(data.low_pass(a, h["accel_filter"]))
-    if data.speed is not None:
-        v = np.empty(len(data.time))
-        read_late(data.time, grid.time, gained, h["speed_delay"], v)
-        out.append(data.held(data.low_pass(v, h["speed_filter"])))
-    return np.stack(out)
+    return np.stack([x for x in h.recorder_rows(accel, gained) if x is not None])
+
+
+def speed_gained(grid: Grid, accel: FloatArray) -> FloatArray:
+    """Speed [m/s] that an acceleration (grid,) [m/s²] beyond the plant's adds."""
+    step = np.where(grid.starts, 0.0, np.diff(grid.time, prepend=grid.time[:1]))
+    return np.cumsum(step * np.concatenate([accel[:1], accel[:-1]]))
 
 
 def measured_readings(data: DriveData) -> FloatArray:

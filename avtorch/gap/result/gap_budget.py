@@ -4,32 +4,57 @@ Energies are squared errors of free runs of 10 s on held-out blocks, each channe
 channels. The floor is what the last model leaves after a black box on top, taught by other blocks. A part's share is
 what it takes off on top of the parts before it, over the whole gap; shares and what is unexplained sum to 1. Intervals
 are the bootstrap's over blocks (Efron and Tibshirani 1993). Blocks measure what is named; they name nothing.
+
+Beside it, by families: what acts in each place of the car, whatever its name, and what could act there unseen. What a
+family takes off is the difference of held-out free runs with and without it, everything else refitted, so that the
+order of causes changes nothing. Its size is the root mean square of what its parts add to the readings. An effect that
+is not there would gain half the square of its response in units of the noise, less what free parameters take up; the
+size at which that is the cost of an effect's presence is the least that shows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from avtorch.arrays import FloatArray
-from avtorch.gap.answer.budget import LIKELY, MATERIAL, Budget, ChancePart, ChannelError, Part, Unexplained
+from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.engine.average import ModelAverage
-from avtorch.gap.quantity import Quantity
+from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name
+from avtorch.gap.engine.family import FAMILIES, FORMS, OWN, family_of
+from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.likelihood import whiten
+from avtorch.gap.engine.priors import EFFECT_NATS
+from avtorch.gap.engine.search import Projection, tried
+from avtorch.gap.quantity import Quantity, of_fields
+from avtorch.gap.result.budget import (
+    LIKELY,
+    MATERIAL,
+    Budget,
+    ChancePart,
+    ChannelError,
+    FamilyShare,
+    Part,
+    Unexplained,
+)
+from avtorch.gap.result.free_form import FittedForm
+from avtorch.gap.result.free_runs import Blocks
 from avtorch.gap.result.held_out import HeldOut
 from avtorch.gap.result.hypotheses import aliases_of, implausible, onset_of, part_probability
 from avtorch.gap.result.parameters import ParameterPosterior
-from avtorch.gap.simulator.effect import EFFECTS
+from avtorch.gap.result.parts import AnswerPart, map_size
+from avtorch.gap.simulator.effect import EFFECTS as TABLE
 from avtorch.io import Log
 
 CHANCE = ("gust", "outliers", "command_hold")
 """Causes that chance decides: no free run foretells them."""
-_RESAMPLES = 400
+RESAMPLES = 400
+"""Of blocks, with replacement."""
 _NOTHING = 1e-3  # of the energy before, below which free runs show no gap
 _NO_GAP = 0.1  # share of the error before that is within the floor: nothing to close
+_DRAWS = 48  # of parameters, for the size of a family
 
 
 @dataclass(frozen=True)
@@ -48,23 +73,17 @@ class MetricShrinkage:
     closed: Quantity | None
     horizon_s: float | None = None
 
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Shrinkage:
     """How far the gap shrinks on held-out blocks of the drives.
 
-    `metric`: the one of `by_metric` in which the gap is clearest. `placebo`: what `placebo_effect`, a wrong effect with
-    about as many parameters, closes when added. `ceiling`: error after a flexible black box is added to the bare
-    baseline, by metric. `blocks`: number of held-out blocks. `by_drives`: whole drives were held out.
+    `metric`: the one of `by_metric` in which the gap is clearest. `ceiling`: error after a flexible black box is added
+    to the bare baseline, by metric. `blocks`: number of held-out blocks. `by_drives`: whole drives were held out.
     """
 
     metric: str
     by_metric: Mapping[str, MetricShrinkage]
-    placebo_effect: str | None
-    placebo: Quantity | None
     ceiling: Mapping[str, float]
     blocks: int
     by_drives: bool = False
@@ -75,18 +94,9 @@ class Shrinkage:
 
     def to_dict(self) -> dict[str, Any]:
         """The object `shrinkage` of `diagnosis.json`."""
-        placebo = None if self.placebo is None else self.placebo.to_dict()
-        return {
-            "metric": self.metric,
-            "heldout": True,
-            **self.top.to_dict(),
-            "by_metric": {name: closed.to_dict() for name, closed in self.by_metric.items()},
-            "placebo": {"effect": self.placebo_effect, "closed": placebo},
-            "ceiling": dict(self.ceiling),
-            "chosen": None,
-            "blocks": self.blocks,
-            "heldout_by": "drives" if self.by_drives else "blocks",
-        }
+        out = of_fields(self) | of_fields(self.top)
+        out |= {"heldout": True, "heldout_by": "drives" if out.pop("by_drives") else "blocks"}
+        return out | {"placebo": {"effect": None, "closed": None}, "chosen": None}
 
 
 def budget_of(
@@ -107,69 +117,69 @@ def budget_of(
     `none` it does not.
     """
     energy, floor = _energies(held)
-    draws = _resampled(energy, floor, seed)
+    draws = _shares(energy, floor, seed)
     shares = {name: draws[:, k] for k, name in enumerate(held.names)}
     own = posterior.by_effect()
-    onsets = {name: onset_of(posterior.weight, name, logs) for name in names}
-    parts, rest = [], draws[:, -1]
-    steps = dict(zip(held.names, pairwise(energy.mean(1)), strict=True))
+    after = dict(zip(held.names, energy.mean(1)[1:], strict=True))
     bottom = float(floor.mean())
+    by_chance = [name for name in dict.fromkeys((*CHANCE, *chance)) if name in names]
+    parts = []
     for name in names:
-        if name in CHANCE or name in chance or name in ("none", "unknown"):
+        if name in by_chance or name in ("none", "unknown"):
             continue
         # a road is in the noise's spectrum: it takes off what the black box knows of the place
         share = shares.get(name, np.zeros(len(draws)))
-        after = steps[name][1] if name in steps else energy.mean(1)[-1]
-        quantities = own.get(name, {})
-        began = onsets[name]
-        kinds = [EFFECTS[name]] if name in EFFECTS else []
+        began = onset_of(posterior.weight, name, logs)
         parts.append(
             Part(
                 name,
                 aliases_of(average, name),
                 part_probability(average, name),
-                _quantity(share),
-                float(np.sqrt(after / bottom)),
-                quantities,
+                Quantity.of_resampled(share[0], share),
+                float(np.sqrt(after.get(name, energy[-1].mean()) / bottom)),
+                own.get(name, {}),
                 None if began is None else began.stamp_s,
-                not implausible(quantities, {}, kinds),
+                _plausible(name, own),
             )
         )
-    named_parts = {p.name for p in parts}
-    carried = _quantity(shares["free form"]) if "free form" in shares else None
-    for name, share in shares.items():  # what the hypothesis holds and the label does not name
-        if name not in named_parts:
-            rest = rest + share
-    if not parts:
-        rest = np.ones(len(draws))
     parts.sort(key=lambda p: -p.share.mean)
-    unnamed = _quantity(rest)
+    named_parts = {p.name for p in parts}
+    # with what the hypothesis holds and the label does not name
+    rest = sum((share for name, share in shares.items() if name not in named_parts), draws[:, -1])
+    rest = rest if parts else np.ones(len(draws))
     beyond = float((rest > material).mean()) if parts else 0.0
     matters = beyond > 0.95 if parts else tuple(names) == ("unknown",)
     if not parts and names[0] not in ("none", "unknown"):  # chance alone is named, and no part of a simulator is
         matters = held.free and _surely_takes_off(energy, seed) > material
     most = max(sum(p.share.mean for p in parts), 1.0)  # an effect without a name may cost instead of taking off
     parts = [replace(p, share=p.share.scaled(1 / most)) for p in parts]
-    unnamed = _shifted(unnamed, 1 - sum(p.share.mean for p in parts) - unnamed.mean)
-    by_channel = {
-        name: ChannelError(*(float(np.sqrt(x)) for x in levels))
-        for name, levels in zip(held.data.channels, _levels(held), strict=True)
-    }
+    carried = shares.get("free form")
     return Budget(
         before=float(np.sqrt(energy[0].mean() / bottom)),
         left=float(np.sqrt(energy[-1].mean() / bottom)),
-        by_channel=by_channel,
+        by_channel=dict(zip(held.data.channels, _levels(held), strict=True)),
         parts=tuple(parts),
         unexplained=Unexplained(
-            unnamed,
+            Quantity.of_resampled(1 - sum(p.share.mean for p in parts), rest),
             matters,
             average.probabilities["unknown"] if not parts else beyond,
             still=_still(held, seed),
-            carried=carried,
+            carried=None if carried is None else Quantity.of_resampled(carried[0], carried),
         ),
         baseline={key: held.chain[0][key] for key in ("T_L", "K_L")},
         repaired=posterior.moved(),
-        chance=_chance(average, posterior, names, tuple(dict.fromkeys((*CHANCE, *chance)))),
+        chance=tuple(
+            ChancePart(
+                name,
+                part_probability(average, name),
+                _share_of_noise(posterior, name),
+                own.get(name, {}),
+                _plausible(name, own),
+                aliases_of(average, name),
+            )
+            for name in by_chance
+            if part_probability(average, name) >= LIKELY
+        ),
         material=material,
         horizon_s=held.horizon_s,
         by_drives=held.blocks.by_drives,
@@ -178,38 +188,91 @@ def budget_of(
 
 def shrinkage_of(held: HeldOut, seed: int = 0) -> Shrinkage:
     """How far the gap shrinks on held-out blocks with all causes, by measure."""
-    rng = np.random.default_rng(seed)
-    blocks = len(held.blocks.rows)
-    pick = rng.integers(0, blocks, (_RESAMPLES, blocks))
-    sizes = np.asarray(held.blocks.sizes, float)
+    blocks, sizes = len(held.blocks.rows), held.blocks.sizes
+    pick = np.random.default_rng(seed).integers(0, blocks, (RESAMPLES, blocks))
+    four = (held.steps[0], held.steps[-1], held.floor, held.ceiling)
     out: dict[str, MetricShrinkage] = {}
     ceiling: dict[str, float] = {}
     for c, channel in enumerate(held.data.channels):
-        squares = np.stack([x.squares[c] for x in (held.steps[0], held.steps[-1], held.floor, held.ceiling)])
+        squares = np.stack([x.squares[c] for x in four])
         rms = np.sqrt(squares.sum(1) / sizes.sum())
         drawn = np.sqrt(squares[:, pick].sum(-1) / sizes[pick].sum(-1))
         name = f"rollout_rmse_{channel}"
-        out[name] = _metric(rms, drawn, held.horizon_s)
-        ceiling[name] = float(rms[3])
-    rows = held.frame_rows
-    nats = np.stack([x.nats for x in (held.steps[0], held.steps[-1], held.floor, held.ceiling)])
+        out[name], ceiling[name] = _metric(rms, drawn, held.horizon_s), float(rms[3])
+    rows, nats = held.frame_rows, np.stack([x.nats for x in four])
     mean = nats.sum(1) / rows.sum()
     drawn = nats[:, pick].sum(-1) / rows[pick].sum(-1)
+    # the measure in which the gap shows most
+    top = max(out, key=lambda k: out[k].before / max(out[k].floor, 1e-12))
+    if all(x.closed is None for x in out.values()):
+        top = "log_predictive_density"
     out["log_predictive_density"] = _metric(mean, drawn, None, density=True)
     ceiling["log_predictive_density"] = float(mean[3])
-    rollouts = [k for k in out if k != "log_predictive_density"]
-    # the measure in which the gap shows most
-    clearest = max(rollouts, key=lambda k: out[k].before / max(out[k].floor, 1e-12))
-    top = clearest if any(out[k].closed is not None for k in rollouts) else "log_predictive_density"
-    return Shrinkage(
-        metric=top,
-        by_metric=out,
-        placebo_effect=None,
-        placebo=None,
-        ceiling=ceiling,
-        blocks=blocks,
-        by_drives=held.blocks.by_drives,
-    )
+    return Shrinkage(top, out, ceiling, blocks, held.blocks.by_drives)
+
+
+def families_of(
+    average: ModelAverage,
+    posterior: ParameterPosterior,
+    parts: Sequence[AnswerPart],
+    held: HeldOut,
+    free: FittedForm | None,
+    *,
+    among: Sequence[str],
+    seed: int = 0,
+) -> tuple[FamilyShare, ...]:
+    """Every family: those that are likely there, what takes most off first, then the others.
+
+    `posterior`: of the verdict's weight; `parts` of the answer; `held` as it was made with the families left out;
+    `free`: what the repaired simulator carries; `among`: effects that were tried, by the engine's names.
+    """
+    h = posterior.hypothesis
+    unseen = least_visible(h, among)
+    out = []
+    for family in (*FAMILIES, OWN):
+        own = [part for part in parts if part.family == family and part.probability >= LIKELY]
+        carried = family == "force map" and free is not None
+        # what free runs bear out is there, whatever the evidence says of knots
+        probability = max(min(average.families.get(family, 0.0), 1.0), float(carried))
+        if family == OWN and not own:
+            continue
+        names = tuple(part.name for part in own if part.name is not None)
+        form = next((part.form for part in own if part.name is None), "F(u, v)" if carried else None)
+        there = probability >= LIKELY
+        hidden = h.force.takes_up if family == "force map" and h.force is not None else ()
+        typical, least = unseen.get(family, (None, None))
+        out.append(
+            FamilyShare(
+                family,
+                names,
+                form,
+                tuple(n for n in (FAMILIES["force map"] if carried else hidden) if n not in names),
+                probability,
+                _size(posterior, own, held.blocks, free if carried else None, seed) if there else None,
+                _takes_off(held, family, seed) if there else None,
+                excited=typical is None or typical >= EFFECT_NATS,
+                unseen_mps2=least,
+            )
+        )
+    return tuple(sorted(out, key=lambda f: (not f.present, -(f.takes_off.mean if f.takes_off else 0.0))))
+
+
+def least_visible(h: Hypothesis, among: Sequence[str]) -> Mapping[str, tuple[float, float]]:
+    """By family, of its effects that `h` has not: the nats that the most visible one would gain at its typical size,
+    and the root mean square [m/s²] of the least visible one at the size that gains `EFFECT_NATS`."""
+    projection, response = Projection(h), h.rows()
+    nats: dict[str, list[float]] = {}
+    sizes: dict[str, list[float]] = {}
+    for e in tried(h, among):
+        found = [_shown(h, projection, response, e.name, start) for start in e.starts]
+        found = [(gain, size) for gain, size in found if gain > 0 and size > 0]
+        if e.name.startswith("~") or not found:
+            continue
+        gain, size = max(found)
+        family = family_of(base_name(e.name))
+        nats.setdefault(family, []).append(gain)
+        sizes.setdefault(family, []).append(size * float(np.sqrt(EFFECT_NATS / gain)))
+    return {family: (max(nats[family]), max(sizes[family])) for family in nats}
 
 
 # inside ---------------------------------------------------------------------------------------------------------------
@@ -223,21 +286,16 @@ def _energies(held: HeldOut) -> tuple[FloatArray, FloatArray]:
     return (levels / scale).mean(1), (bottom / scale).mean(0)
 
 
-def _levels(held: HeldOut) -> list[tuple[float, float, float]]:
-    """Mean squares before, at the floor and left, a channel."""
-    count = float(np.sum(held.blocks.sizes))
-    out = []
-    for c in range(len(held.data.channels)):
-        before, left, floor = (float(x.squares[c].sum()) / count for x in (held.steps[0], held.steps[-1], held.floor))
-        out.append((before, min(floor, left), left))
-    return out
+def _levels(held: HeldOut) -> list[ChannelError]:
+    """Root mean squares before, at the floor and left, a channel."""
+    three = np.stack([x.squares.sum(1) for x in (held.steps[0], held.floor, held.steps[-1])])
+    three[1] = np.minimum(three[1], three[2])
+    return [ChannelError(*map(float, x)) for x in np.sqrt(three / held.blocks.sizes.sum()).T]
 
 
-def _resampled(energy: FloatArray, floor: FloatArray, seed: int) -> FloatArray:
+def _shares(energy: FloatArray, floor: FloatArray, seed: int) -> FloatArray:
     """Shares (draw, part and rest) of the gap under resampled blocks; the first draw is of the blocks themselves."""
-    blocks = energy.shape[1]
-    pick = np.random.default_rng(seed).integers(0, blocks, (_RESAMPLES, blocks))
-    pick[0] = np.arange(blocks)
+    pick = resamples(energy.shape[1], np.random.default_rng(seed))
     levels = np.moveaxis(energy[:, pick].mean(-1), 0, 1)  # draw, model
     bottom = np.minimum(floor[pick].mean(-1), levels[:, -1])
     parts = np.column_stack([np.maximum(-np.diff(levels, axis=1), 0.0), levels[:, -1] - bottom])
@@ -250,7 +308,7 @@ def _resampled(energy: FloatArray, floor: FloatArray, seed: int) -> FloatArray:
 def _surely_takes_off(energy: FloatArray, seed: int) -> float:
     """The lower end of what the last step takes off, in shares of the error before, under resampled blocks."""
     blocks = energy.shape[1]
-    pick = np.random.default_rng(seed).integers(0, blocks, (_RESAMPLES, blocks))
+    pick = np.random.default_rng(seed).integers(0, blocks, (RESAMPLES, blocks))
     before, named, last = (energy[k][pick].mean(1) for k in (0, -2, -1))
     return float(np.quantile((named - last) / before, 0.05))
 
@@ -264,28 +322,22 @@ def _still(held: HeldOut, seed: int) -> Quantity:
     plant, box = held.steps[-1].squares[-1], held.rival.squares[-1]
     named = held.steps[len(held.chain) - 1].squares[-1]
     possible = held.possible[:, -1]
-    blocks = len(plant)
     rng = np.random.default_rng(seed)
-    pick = rng.integers(0, blocks, (_RESAMPLES, blocks))
-    pick[0] = np.arange(blocks)
+    pick = resamples(len(plant), rng)
     total = np.maximum(plant[pick].sum(1), 1e-12)
     did = np.clip((plant - box)[pick].sum(1) / total, 0.0, 1.0)
-    drawn = np.take_along_axis(possible[rng.integers(0, len(possible), _RESAMPLES)], pick, 1).sum(1)
+    drawn = np.take_along_axis(possible[rng.integers(0, len(possible), RESAMPLES)], pick, 1).sum(1)
     could = np.clip((drawn - np.maximum((named - plant)[pick].sum(1), 0.0)) / total, 0.0, 1.0)
     low, high = float(np.quantile(did, 0.05)), float(np.quantile(np.maximum(did, could), 0.95))
     mean = float(did[0])
     return Quantity(mean, float(did.std()), min(low, mean), max(high, mean))
 
 
-def _quantity(draws: FloatArray) -> Quantity:
-    """The first draw's value with the interval of all."""
-    q05, q95 = np.quantile(draws, (0.05, 0.95))
-    mean = float(draws[0])
-    return Quantity(mean, float(draws.std()), float(min(q05, mean)), float(max(q95, mean)))
-
-
-def _shifted(q: Quantity, by: float) -> Quantity:
-    return Quantity(q.mean + by, q.sd, min(q.q05, q.mean + by), max(q.q95, q.mean + by))
+def resamples(blocks: int, rng: np.random.Generator) -> IntArray:
+    """Numbers (draw, block) of resampled blocks; the first draw is the blocks themselves."""
+    pick = rng.integers(0, blocks, (RESAMPLES, blocks))
+    pick[0] = np.arange(blocks)
+    return pick
 
 
 def _metric(levels: FloatArray, drawn: FloatArray, horizon: float | None, *, density: bool = False) -> MetricShrinkage:
@@ -298,32 +350,12 @@ def _metric(levels: FloatArray, drawn: FloatArray, horizon: float | None, *, den
         bottom = np.maximum(drawn[2], drawn[1]) if density else np.minimum(drawn[2], drawn[1])
         shares = (drawn[0] - drawn[1]) / np.where(drawn[0] == bottom, np.inf, drawn[0] - bottom)
         value = (before - after) / (before - floor)
-        q05, q95 = np.quantile(shares, (0.05, 0.95))
-        closed = Quantity(float(value), float(shares.std()), float(min(q05, value)), float(max(q95, value)))
+        closed = Quantity.of_resampled(value, shares)
     return MetricShrinkage(float(before), float(after), float(floor), closed, horizon)
 
 
-def _chance(
-    average: ModelAverage, posterior: ParameterPosterior, names: Sequence[str], chance: Sequence[str]
-) -> tuple[ChancePart, ...]:
-    own: Mapping[str, Mapping[str, Quantity]] = posterior.by_effect()
-    out = []
-    for name in chance:
-        if name not in names or part_probability(average, name) < LIKELY:
-            continue
-        quantities = dict(own.get(name, {}))
-        kinds = [EFFECTS[name]] if name in EFFECTS else []
-        out.append(
-            ChancePart(
-                name,
-                part_probability(average, name),
-                _share_of_noise(posterior, name),
-                quantities,
-                not implausible(quantities, {}, kinds),
-                aliases_of(average, name),
-            )
-        )
-    return tuple(out)
+def _plausible(name: str, own: Mapping[str, Mapping[str, Quantity]]) -> bool:
+    return not implausible(own.get(name, {}), {}, [TABLE[name]] if name in TABLE else [])
 
 
 def _share_of_noise(posterior: ParameterPosterior, name: str) -> float | None:
@@ -339,3 +371,76 @@ def _share_of_noise(posterior: ParameterPosterior, name: str) -> float | None:
         total = float((found.errors**2).sum())
         return float(np.clip((found.errors[found.flags] ** 2).sum() / max(total, 1e-12), 0.0, 1.0))
     return None
+
+
+def _shown(
+    h: Hypothesis, projection: Projection, response: Sequence[FloatArray], effect: str, start: Sequence[float]
+) -> tuple[float, float]:
+    """Expected nats and root mean square [m/s²] of an effect beside `h`."""
+    # what has to set in during the drive does so half way
+    middle = 0.5 * float(h.data.time[0] + h.data.time[-1]) if EFFECTS[effect].onset == "must" else None
+    beside = h.with_effect(effect, start, middle)
+    change = [a - b for a, b in zip(beside.rows(), response, strict=True)]
+    free = projection(whiten(h.data, h.covariance, h.data.transform(change)))
+    return 0.5 * float(free @ free), max(float(np.sqrt((x**2).mean())) for x in change)
+
+
+def _size(
+    posterior: ParameterPosterior, own: Sequence[AnswerPart], blocks: Blocks, free: FittedForm | None, seed: int
+) -> Quantity | None:
+    """Root mean square [m/s²] of what the parts of a family do together; of a random cause by its own size."""
+    h, names = posterior.hypothesis, [part.name for part in own]
+    effects = [e for e in h.effects if base_name(e) in names and EFFECTS[e].coordinates]
+    rng = np.random.default_rng(seed)
+    total = np.zeros(_DRAWS)
+    if effects:
+        total += _drawn_squares(posterior, effects, blocks, rng)
+    if any(part.name is None and part.form not in FORMS for part in own) and h.force is not None:
+        if not effects:
+            return map_size(h, seed)
+        total += map_size(h, seed).mean ** 2
+    elif free is not None:
+        adds = free.without([])
+        total += _block_squares(blocks, np.interp(h.data.time, h.data.grid.time, adds)[None], rng)
+    if total.any():
+        return Quantity.of_draws(np.sqrt(total))
+    return next((part.size_mps2 for part in own if part.size_mps2 is not None), None)
+
+
+def _drawn_squares(
+    posterior: ParameterPosterior, effects: Sequence[str], blocks: Blocks, rng: np.random.Generator
+) -> FloatArray:
+    h, draws = posterior.hypothesis, posterior.draws
+    x = draws.x.reshape(-1, len(draws.names))
+    at = [INDEX[name] for name in draws.names]
+    own = [INDEX[c.name] for e in effects for c in EFFECTS[e].coordinates]
+    out = np.empty(_DRAWS)
+    for k, i in enumerate(np.linspace(0, len(x) - 1, _DRAWS).astype(int)):
+        values = h.values.copy()
+        values[at] = x[i]
+        without = values.copy()
+        without[own] = h.neutral[own]
+        does = np.stack(h.rows(values)) - np.stack(h.rows(without))
+        out[k] = _block_squares(blocks, does, rng, 1)[0]
+    return out
+
+
+def _block_squares(blocks: Blocks, does: FloatArray, rng: np.random.Generator, count: int = _DRAWS) -> FloatArray:
+    """Mean squares (draw,) of rows (channel, row) over resampled blocks, of the channel that shows it most."""
+    squares = np.stack([(does[:, rows] ** 2).mean(1) for rows in blocks.rows], 1)
+    pick = rng.integers(0, len(blocks.rows), (count, len(blocks.rows)))
+    return squares[:, pick].mean(-1).max(0)
+
+
+def _takes_off(held: HeldOut, family: str, seed: int) -> Quantity | None:
+    """Share of the gap that free runs miss without the family, under resampled blocks."""
+    without = held.apart.get(family)
+    if without is None:
+        return None
+    before, after, floor = (x.squares for x in (held.steps[0], held.steps[-1], held.floor))
+    scale = np.maximum(np.minimum(floor, after).mean(1), 1e-12)[:, None]
+    before, after, less, floor = ((x / scale).mean(0) for x in (before, after, without.squares, floor))
+    pick = resamples(len(after), np.random.default_rng(seed))
+    whole = np.maximum((before - np.minimum(floor, after))[pick].mean(1), 1e-9)
+    draws = np.clip((less - after)[pick].mean(1) / whole, 0.0, 1.0)
+    return Quantity.of_resampled(draws[0], draws)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.quantity import plain
 from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.rollout_errors import HORIZON_S, reached, rms
 
@@ -34,25 +35,16 @@ class Simulated(NamedTuple):
 
 @dataclass(frozen=True)
 class Repeatability:
-    """Noise floor from `pairs` pairs of windows: `seconds` [s] compared, root mean squares `accel` [m/s²] and `speed`
-    [m/s].
+    """Noise floor from `pairs` pairs of windows: `seconds` [s] compared, root mean squares `floor_accel` [m/s²]
+    and `floor_speed` [m/s].
 
     The speed's is of its change since the settling time. None where the log lacks the channel.
     """
 
     pairs: int
     seconds: float
-    accel: float | None
-    speed: float | None
-
-    def to_dict(self) -> dict[str, Any]:
-        """The object `repeatability` of `gap` in `diagnosis.json`."""
-        return {
-            "pairs": self.pairs,
-            "seconds": self.seconds,
-            "floor_accel": self.accel,
-            "floor_speed": self.speed,
-        }
+    floor_accel: float | None
+    floor_speed: float | None
 
 
 @dataclass(frozen=True)
@@ -84,7 +76,7 @@ class GapSize:
             },
             "detected": bool(self.detected),
             "p_value": self.p_value,
-            "repeats": None if self.repeats is None else self.repeats.to_dict(),
+            "repeats": plain(self.repeats),
         }
 
 

@@ -21,16 +21,16 @@ import numpy as np
 from scipy.special import multigammaln  # pyright: ignore[reportAttributeAccessIssue]
 
 from avtorch.arrays import BoolArray, FloatArray
-from avtorch.gap.answer.budget import HORIZON_S
 from avtorch.gap.engine.coordinates import INDEX, base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.family import family_of
 from avtorch.gap.engine.gauss_newton import fit, linear_priors, linearised, penalty
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance, whiten
-from avtorch.gap.result.black_box_rest import BlackBox
+from avtorch.gap.result.black_box_rest import BlackBox, Predicted
+from avtorch.gap.result.budget import HORIZON_S
 from avtorch.gap.result.free_form import FittedForm
-from avtorch.gap.result.free_runs import Blocks, compared, measured_readings, readings
+from avtorch.gap.result.free_runs import Blocks, compared, measured_readings, readings, speed_gained
 
 _STEPS = 3  # of a fold's fit
 _DAMPED = (1.0, 0.3, 0.1)  # of a step that loses
@@ -105,50 +105,29 @@ def held_out_errors(chain: Sequence[Hypothesis], free: FittedForm | None = None)
     `free`: a form beside the last, which the repaired simulator carries: what it leaves is the last step.
 
     None where the drives are too short for `FEWEST` blocks.
-
-    Example:
-        >>> from avtorch import Leader, simulate
-        >>> from avtorch.gap import ConstantResistance, plant
-        >>> from avtorch.gap.engine.drive_data import DriveData
-        >>> from avtorch.gap.engine.gauss_newton import fit
-        >>> from avtorch.gap.engine.recorder import base_fit
-        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.05)
-        >>> log = simulate(Leader.default(start=30.0, duration=120.0, dt=0.05), plant=dragging).log()
-        >>> base = base_fit(DriveData.of(log))
-        >>> held = held_out_errors([base, fit(base.with_effect("constant_resistance", (0.1,)))])
-        >>> before, after = (step.squares.sum(-1) for step in held.steps)
-        >>> held.names, bool((after < 0.5 * before).all())
-        (('constant_resistance',), True)
     """
     data = chain[-1].data
     blocks = Blocks.of(data)
     if blocks is None:
         return None
     fitted = [_taught(h, blocks) for h in chain]
-    stitched = [blocks.stitched(list(x.errors)) for x in fitted]
-    scored = [_scores(data, blocks, e, x.residuals, x.residuals) for x, e in zip(fitted, stitched, strict=True)]
-    beside, possible = [], []
-    for x, errors in ((fitted[-1], stitched[-1]), (fitted[0], stitched[0])):
-        found = BlackBox.of(x.hypothesis).predict(x.residuals, errors, blocks)
-        possible.append(found.possible)
-        rest = errors - blocks.stitched(list(found.readings))
-        beside.append(_scores(data, blocks, rest, x.residuals, x.residuals - found.coefficients))
-    floor = beside[0]
+    steps = [x.scores(blocks) for x in fitted]
+    ends = (fitted[-1], fitted[0])
+    found = [BlackBox.of(x.hypothesis).predict(x.residuals, x.errors, blocks) for x in ends]
+    rival, ceiling = (x.scores(blocks, beside) for x, beside in zip(ends, found, strict=True))
     if free is not None:
-        scored.append(_with_form(free, blocks))
-        floor = _lower(floor, scored[-1])
-    longest = max(rows.stop - rows.start for rows in blocks.rows) * data.dt
+        steps.append(_with_form(free, free.lagged, blocks))
     return HeldOut(
         chain=tuple(chain),
         blocks=blocks,
-        steps=tuple(scored),
-        floor=floor,
-        rival=beside[0],
-        ceiling=beside[1],
-        possible=possible[0],
-        horizon_s=min(HORIZON_S, longest),
+        steps=tuple(steps),
+        floor=rival if free is None else _lower(rival, steps[-1]),
+        rival=rival,
+        ceiling=ceiling,
+        possible=found[0].possible,
+        horizon_s=min(HORIZON_S, max(rows.stop - rows.start for rows in blocks.rows) * data.dt),
         free=free is not None,
-        apart=_apart(fitted[-1].hypothesis, scored, blocks, free),
+        apart=_apart(fitted[-1].hypothesis, steps, blocks, free),
     )
 
 
@@ -168,12 +147,10 @@ def _apart(full: Hypothesis, scored: Sequence[Scores], blocks: Blocks, free: Fit
             continue
         rest = fit(rest, 6, 0.1)
         if beside is None:
-            fitted = _taught(rest, blocks)
-            errors = blocks.stitched(list(fitted.errors))
-            out[family] = _scores(full.data, blocks, errors, fitted.residuals, fitted.residuals)
+            out[family] = _taught(rest, blocks).scores(blocks)
         else:
             rest["T_L"] = float(np.clip(beside.form.T_L * rest["T_L"] / full["T_L"], *rest.limits("T_L")))
-            out[family] = _with_form(beside, blocks, rest)
+            out[family] = _with_form(beside, rest, blocks)
     if free is not None and "force map" not in out:
         out["force map"] = scored[-2]
     return out
@@ -190,7 +167,7 @@ def nested(base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis] = (
     chain = [full]
     while len(_sized(chain[-1])) > 1:
         now = chain[-1]
-        rest = {e: known.get(_key(now, e)) or _refitted(now, e) for e in _sized(now)}
+        rest = {e: known.get(_key(now, e)) or fit(_less(now, e), 6, 0.1) for e in _sized(now)}
         cost = {e: float((_run_squares(h) / floor).mean()) for e, h in rest.items()}
         chain.append(rest[min(cost, key=lambda e: cost[e])])
     return [base, *(reversed(chain) if _sized(full) else ())]
@@ -204,25 +181,46 @@ def entered(before: Hypothesis, after: Hypothesis) -> str:
 # fits -----------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class _Taught:
-    """A hypothesis fitted without each fold: residuals of all frames (fold, channel, frame, bin), and errors (fold,
-    channel, row) of readings."""
+    """What fits of a hypothesis without each fold leave: `residuals` (fold, channel, frame, bin) of all frames, and
+    `errors` (channel, row) of readings, each block's by the fit without it."""
 
     hypothesis: Hypothesis
     residuals: FloatArray
     errors: FloatArray
 
+    @classmethod
+    def of(cls, h: Hypothesis, rows: Sequence[FloatArray], blocks: Blocks) -> _Taught:
+        """Of readings (channel, row) by each fold's fit."""
+        data = h.data
+        residuals = np.array([data.measured - data.transform(compared(data, x)) for x in rows])
+        return cls(h, residuals, blocks.stitched([measured_readings(data) - x for x in rows]))
+
+    def scores(self, blocks: Blocks, beside: Predicted | None = None) -> Scores:
+        """Errors of free runs, and densities by the noise that the fits leave, with a black box's predictions `beside`
+        where given."""
+        data, errors, residuals = self.hypothesis.data, self.errors, self.residuals
+        if beside is not None:
+            errors, residuals = errors - blocks.stitched(beside.readings), residuals - beside.coefficients
+        fold = blocks.fold[blocks.block_of_frame]
+        nats = np.zeros(len(fold))
+        for k, frames in enumerate(blocks.taught):
+            own = fold == k
+            nats[own] = _log_density(data.only(frames), self.residuals[k][:, frames], residuals[k][:, own])
+        return Scores(
+            blocks.sums(blocks.free_runs(data, errors) ** 2),
+            np.asarray(np.bincount(blocks.block_of_frame, nats, len(blocks.rows)), np.float64),
+        )
+
 
 def _taught(h: Hypothesis, blocks: Blocks) -> _Taught:
     h = _without_chance(h)
     slopes, *_ = linearised(h, h.free)
-    residuals, errors = [], []
+    rows = []
     for frames in blocks.taught:
         fold, taught = h.copy(), _fold_fit(h, slopes, frames)
         fold.values, fold.force_coefficients = taught.values, taught.force_coefficients
-        rows = readings(fold, *fold.on_grid())
-        residuals.append(h.data.measured - h.data.transform(compared(h.data, rows)))
-        errors.append(measured_readings(h.data) - rows)
-    return _Taught(h, np.array(residuals), np.array(errors))
+        rows.append(readings(fold, *fold.on_grid()))
+    return _Taught.of(h, rows, blocks)
 
 
 def _fold_fit(h: Hypothesis, slopes: FloatArray, frames: BoolArray) -> Hypothesis:
@@ -275,10 +273,6 @@ def _key(h: Hypothesis, without: str | None = None) -> frozenset[tuple[str, bool
     return frozenset((e, e in h.onsets) for e in h.effects if e != without)
 
 
-def _refitted(h: Hypothesis, without: str) -> Hypothesis:
-    return fit(_less(h, without), 6, 0.1)
-
-
 def _less(h: Hypothesis, effect: str) -> Hypothesis:
     rest = h.without(effect)
     if effect == "dead_time":  # what was a delay is a lag now
@@ -286,20 +280,13 @@ def _less(h: Hypothesis, effect: str) -> Hypothesis:
     return rest
 
 
-def _with_form(free: FittedForm, blocks: Blocks, beside: Hypothesis | None = None) -> Scores:
-    """Of a hypothesis with its free form, which each fold's other blocks teach; `beside`: in place of the form's."""
-    h = free.lagged if beside is None else beside
-    accel, gained = h.on_grid()
-    grid = h.data.grid
-    step = np.where(grid.starts, 0.0, np.diff(grid.time, prepend=grid.time[:1]))
-    errors, residuals = [], []
+def _with_form(free: FittedForm, h: Hypothesis, blocks: Blocks) -> Scores:
+    """Of a hypothesis with the free form beside it, which each fold's other blocks teach."""
+    (accel, gained), rows = h.on_grid(), []
     for k in range(len(blocks.taught)):
-        adds = free.without([rows for rows, fold in zip(blocks.rows, blocks.fold, strict=True) if fold == k])
-        more = np.cumsum(step * np.concatenate([adds[:1], adds[:-1]]))
-        rows = readings(h, accel + adds, gained + more)
-        errors.append(measured_readings(h.data) - rows)
-        residuals.append(h.data.measured - h.data.transform(compared(h.data, rows)))
-    return _scores(h.data, blocks, blocks.stitched(errors), np.array(residuals), np.array(residuals))
+        adds = free.without([own for own, fold in zip(blocks.rows, blocks.fold, strict=True) if fold == k])
+        rows.append(readings(h, accel + adds, gained + speed_gained(h.data.grid, adds)))
+    return _Taught.of(h, rows, blocks).scores(blocks)
 
 
 def _lower(a: Scores, b: Scores) -> Scores:
@@ -316,17 +303,6 @@ def _run_squares(h: Hypothesis) -> FloatArray:
     h = _without_chance(h)
     errors = measured_readings(h.data) - readings(h, *h.on_grid())
     return blocks.sums(blocks.free_runs(h.data, errors) ** 2).sum(-1) + 1e-12
-
-
-def _scores(data: DriveData, blocks: Blocks, errors: FloatArray, taught: FloatArray, residuals: FloatArray) -> Scores:
-    """Scores of `errors` (channel, row) and of `residuals` (fold, channel, frame, bin), whose noise `taught` tells."""
-    squares = blocks.sums(blocks.free_runs(data, errors) ** 2)
-    fold = blocks.fold[blocks.block_of_frame]
-    nats = np.zeros(len(fold))
-    for k, frames in enumerate(blocks.taught):
-        own = fold == k
-        nats[own] = _log_density(data.only(frames), taught[k][:, frames], residuals[k][:, own])
-    return Scores(squares, np.asarray(np.bincount(blocks.block_of_frame, nats, len(blocks.rows)), np.float64))
 
 
 def _log_density(taught: DriveData, residual: FloatArray, held_out: FloatArray) -> FloatArray:

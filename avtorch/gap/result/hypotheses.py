@@ -7,21 +7,20 @@ then right about the shape of the gap and wrong about its origin.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 from avtorch.errors import InputError
-from avtorch.gap.answer.budget import LIKELY
 from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.coordinates import base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.outliers import rate_onset
-from avtorch.gap.quantity import Quantity, unit_of
+from avtorch.gap.quantity import Quantity, of_fields, unit_of
+from avtorch.gap.result.budget import LIKELY
 from avtorch.gap.result.parameters import OwnRandom, ParameterPosterior
-from avtorch.gap.simulator.effect import EFFECTS, Effect, candidate_name, delay_effect
-from avtorch.gap.simulator.effect_response import is_observable
+from avtorch.gap.simulator.effect import Effect, candidate_name, delay_effect
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.plant import BASELINE, GapPlant
 from avtorch.io import Log
@@ -66,15 +65,8 @@ class Candidate:
 
     def to_dict(self) -> dict[str, Any]:
         """An entry of `effects`."""
-        return {
-            "name": self.name,
-            "probability": self.probability,
-            "log_evidence": self.log_evidence,
-            "parameters": plain(self.parameters),
-            "moved": plain(self.moved),
-            "onset_s": self.onset_s,
-            **plausibility(self.implausible),
-        }
+        out = of_fields(self)
+        return out | plausibility(out.pop("implausible"))
 
 
 def plausibility(implausible: Sequence[str]) -> dict[str, Any]:
@@ -123,20 +115,6 @@ class Verdict:
         """The verdict as a hypothesis's name."""
         return candidate_name(self.names)
 
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "names": list(self.names),
-            "alias_set": list(self.alias_set),
-            "abstained": self.abstained,
-            "partial": self.partial,
-            "why": self.why,
-        }
-
-
-def plain(quantities: Mapping[str, Quantity]) -> dict[str, dict[str, float]]:
-    """Quantities as plain numbers, for JSON."""
-    return {name: quantity.to_dict() for name, quantity in quantities.items()}
-
 
 @dataclass(frozen=True)
 class Scope:
@@ -149,20 +127,6 @@ class Scope:
     scored: tuple[str, ...] = ()
     not_scored: tuple[str, ...] = ()
     pairs: Literal["all", "some", "none"] = "all"
-
-    @classmethod
-    def of(
-        cls,
-        effects: Sequence[type[Effect]],
-        tried: Collection[str],
-        channels: Collection[str],
-        pairs: Literal["all", "some", "none"],
-    ) -> Self:
-        """The scope of a search among `effects`, limited to those observable in `channels`; `tried`: by name."""
-        own = {e.name: e for e in effects}
-        kinds = own | {n: e for n, e in EFFECTS.items() if n not in own}
-        names = [n for n, e in kinds.items() if is_observable(e, channels)]
-        return cls(tuple(n for n in names if n in tried), tuple(n for n in names if n not in tried), pairs)
 
     @property
     def whole(self) -> bool:
@@ -299,33 +263,6 @@ def best_weight(average: ModelAverage, names: Sequence[str]) -> Weight:
     return max(holding or average.best.values(), key=lambda w: w.log_weight)
 
 
-def alias_set(average: ModelAverage, verdict: str) -> tuple[str, ...]:
-    """Hypotheses that hold nine tenths of the probability, the verdict first."""
-    held, total = [verdict], 0.0
-    for label, p in average.probabilities.items():
-        total += p
-        held.append(label)
-        if total > _HELD or len(held) > _MOST_ALIASES:
-            break
-    return tuple(dict.fromkeys(held))
-
-
-def why(average: ModelAverage, names: Sequence[str], known: str) -> str:
-    """One sentence on the evidence and what comes next."""
-    label = candidate_name(names)
-    words = {"none": "that nothing is missing", "unknown": "a cause without a name"}
-    rest = [(k, p) for k, p in average.probabilities.items() if k != label]
-    rival = f"next likeliest, with {rest[0][1]:.3g}, is {words.get(rest[0][0], rest[0][0])}" if rest else "no rival"
-    if label == "none":
-        return f"No {known} explains the log better than the baseline does; {rival}."
-    if label == "unknown":
-        return f"What is missing answers to no {known}; {rival}."
-    if label in average.probabilities:
-        return f"{label} has probability {average.probabilities[label]:.3g}; {rival}."
-    each = ", ".join(f"{n} {part_probability(average, n):.2g}" for n in names)
-    return f"Each of these causes is there with a probability of a half or more ({each}); {rival}."
-
-
 def candidates_of(
     average: ModelAverage,
     logs: Sequence[Log],
@@ -367,9 +304,27 @@ def candidates_of(
 
 
 def verdict(average: ModelAverage, names: tuple[str, ...], known: str, partial: bool) -> Verdict:
-    """The verdict of these names."""
-    label = candidate_name(names)
-    return Verdict(names, alias_set(average, label), label == "unknown", why(average, names, known), partial)
+    """The verdict of these names, with the hypotheses that hold nine tenths of the probability, and one sentence on the
+    evidence and what comes next."""
+    label, held, total = candidate_name(names), [candidate_name(names)], 0.0
+    for other, p in average.probabilities.items():
+        total += p
+        held.append(other)
+        if total > _HELD or len(held) > _MOST_ALIASES:
+            break
+    words = {"none": "that nothing is missing", "unknown": "a cause without a name"}
+    rest = [(k, p) for k, p in average.probabilities.items() if k != label]
+    rival = f"next likeliest, with {rest[0][1]:.3g}, is {words.get(rest[0][0], rest[0][0])}" if rest else "no rival"
+    if label == "none":
+        first = f"No {known} explains the log better than the baseline does"
+    elif label == "unknown":
+        first = f"What is missing answers to no {known}"
+    elif label in average.probabilities:
+        first = f"{label} has probability {average.probabilities[label]:.3g}"
+    else:
+        each = ", ".join(f"{n} {part_probability(average, n):.2g}" for n in names)
+        first = f"Each of these causes is there with a probability of a half or more ({each})"
+    return Verdict(names, tuple(dict.fromkeys(held)), label == "unknown", f"{first}; {rival}.", partial)
 
 
 def given_dead_time(

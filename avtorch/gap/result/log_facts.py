@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from avtorch.gap.quantity import of_fields
 from avtorch.io import Log
 
 SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead_accel", "grade")
@@ -52,10 +53,8 @@ class LogFacts:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        given = {"rows": self.rows, "segments": self.segments, "seconds": self.seconds, "rate_hz": self.rate_hz}
-        driven = {"speeds_mps": self.speeds, "commands_mps2": self.commands}
-        ranges = {name: None if ends is None else list(ends) for name, ends in driven.items()}
-        return given | {"signals": list(self.signals), "name": self.name, "epochs_s": list(self.epochs_s)} | ranges
+        out = of_fields(self)
+        return out | {"speeds_mps": out.pop("speeds"), "commands_mps2": out.pop("commands")}
 
 
 def _driven(logs: Sequence[Log], signal: str, apart: float) -> tuple[float, float] | None:

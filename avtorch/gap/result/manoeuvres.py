@@ -14,6 +14,7 @@ BEFORE_S, AFTER_S = 1.0, 4.0
 """What is shown before a manoeuvre begins and after it has ended [s]."""
 _JUMP_S = 0.5  # within which a step is commanded
 _LONGEST_S = 6.0  # of a manoeuvre
+_PAUSE_S = 0.3  # within which a change that rests still goes on
 _SHARE = 0.3  # of the command's 90 % range, from which a change counts
 _LEAST = 0.3  # [m/s²] from which a change counts
 _SLOW = 1.0  # [m/s] below which the car begins from or comes to rest
@@ -26,11 +27,6 @@ _SLOPE_S = 0.4  # over which an acceleration is taken from a speed
 class Response:
     """How one signal answered: its `peak` [m/s²], the time `rise` [s] from 10 to 90 % of the way there, and its `lag`
     [s] behind the command; None where it does not move the command's way, or does not follow it.
-
-    Example:
-        >>> from avtorch.gap.result.manoeuvres import Response
-        >>> Response(-2.1, 0.8, 0.4).peak
-        -2.1
     """
 
     peak: float
@@ -93,17 +89,12 @@ def manoeuvres(traces: Traces, *, most: int = 6, named: bool = True) -> tuple[Ma
             begin = max(first - round(BEFORE_S / step), stretch[0])
             end = min(last + round(AFTER_S / step), stretch[-1]) + 1
             found.append((float(energy[end] - energy[begin]) / whole, kind, first, last, slice(begin, end)))
-    return tuple(
-        _answered(traces, lines, step, *each) for each in _chosen(sorted(found, reverse=True, key=_worth), most)
-    )
+    found.sort(reverse=True, key=lambda change: change[0])
+    return tuple(_answered(traces, lines, step, *each) for each in _chosen(found, most))
 
 
 _Change = tuple[float, str, int, int, slice]
 """Share of the error, kind, first and last row of the change, and the rows about it."""
-
-
-def _worth(change: _Change) -> float:
-    return change[0]
 
 
 def _answered(
@@ -131,18 +122,16 @@ def _chosen(ranked: Sequence[_Change], most: int) -> list[_Change]:
             apart = all(each[4].stop <= other[4].start or other[4].stop <= each[4].start for other in taken)
             if apart and len(taken) < most and sum(other[1] == each[1] for other in taken) < limit:
                 taken.append(each)
-    return sorted(taken, reverse=True, key=_worth)
+    return sorted(taken, reverse=True, key=lambda change: change[0])
 
 
 def _accelerations(traces: Traces, step: float, *, named: bool) -> dict[str, FloatArray]:
     sources = {"measured": traces.measured, "baseline simulator": traces.before}
     sources |= {"with what was named": traces.after} if named else {}
-    if "accel" in traces.channels:
-        k = traces.channels.index("accel")
-        return {"command": traces.command} | {name: values[k] for name, values in sources.items()}
-    half = max(1, round(_SLOPE_S / step / 2))
+    measured, half = "accel" in traces.channels, max(1, round(_SLOPE_S / step / 2))
     return {"command": traces.command} | {
-        name: _slope(values[0], traces, half, step) for name, values in sources.items()
+        name: values[traces.channels.index("accel")] if measured else _slope(values[0], traces, half, step)
+        for name, values in sources.items()
     }
 
 
@@ -159,33 +148,18 @@ def _slope(speed: FloatArray, traces: Traces, half: int, step: float) -> FloatAr
 
 
 def _changes(command: FloatArray, stretch: IntArray, step: float, least: float) -> list[tuple[int, int]]:
-    """First and last row of every change of the command in one direction within a stretch."""
-    if len(stretch) < 3:
-        return []
+    """First and last row of every change of the command in one direction within a stretch, without longer rests."""
     u = command[stretch]
-    pause = max(1, round(0.3 / step))  # within which a change that rests still goes on
-    runs = _runs(u, pause, round(_LONGEST_S / step))
-    return [(int(stretch[i]), int(stretch[j])) for i, j in runs if abs(u[j] - u[i]) >= least]
-
-
-def _runs(u: FloatArray, pause: int, longest: int) -> list[tuple[int, int]]:
-    """Of values: first and last place of each change in one direction, without rests longer than `pause`."""
+    pause, longest = max(1, round(_PAUSE_S / step)), round(_LONGEST_S / step)
     steps = np.sign(np.where(np.abs(np.diff(u)) > 1e-3, np.diff(u), 0.0))
-    moving = np.flatnonzero(steps)
-    found = []
-    i = 0
-    while i < len(moving):
-        j = i
-        while (
-            j + 1 < len(moving)
-            and steps[moving[j + 1]] == steps[moving[i]]
-            and moving[j + 1] - moving[j] <= pause
-            and moving[j + 1] - moving[i] <= longest
-        ):
-            j += 1
-        found.append((int(moving[i]), int(moving[j]) + 1))
-        i = j + 1
-    return found
+    runs: list[tuple[int, int]] = []
+    for k in np.flatnonzero(steps).tolist():
+        first, last = runs[-1] if runs else (0, 0)
+        if runs and steps[k] == steps[first] and k - last <= pause and k - first <= longest:
+            runs[-1] = first, k
+        else:
+            runs.append((k, k))
+    return [(int(stretch[i]), int(stretch[j + 1])) for i, j in runs if abs(u[j + 1] - u[i]) >= least]
 
 
 def _kind(traces: Traces, stretch: IntArray, first: int, last: int, step: float, least: float) -> str:
@@ -204,18 +178,15 @@ def _response(command: FloatArray, line: FloatArray, change: float, step: float)
     side = 1.0 if change > 0 else -1.0
     peak = float(line[(side * line).argmax()])
     start = float(line[: max(1, round(0.5 / step))].mean())
-    ends = [_crossing(side * (line - start), share * (side * (peak - start))) for share in (0.1, 0.9)]
-    rises = side * (peak - start) > 0 and ends[0] is not None and ends[1] is not None
-    rise = (ends[1] - ends[0]) * step if rises and ends[0] is not None and ends[1] is not None else None
+    way = side * (peak - start)
+    first, last = (_crossing(side * (line - start), share * way) for share in (0.1, 0.9))
+    rise = (last - first) * step if way > 0 else None
     return Response(peak, rise or None, _lag(command, line, step))
 
 
-def _crossing(values: FloatArray, level: float) -> float | None:
-    """Place, between rows, at which `values` first rise to `level`."""
-    above = np.flatnonzero(values >= level)
-    if not len(above):
-        return None
-    i = int(above[0])
+def _crossing(values: FloatArray, level: float) -> float:
+    """Place, between rows, at which `values` first rise to `level`, which they reach."""
+    i = int((values >= level).argmax())
     return float(i) if i == 0 else i - 1 + float((level - values[i - 1]) / (values[i] - values[i - 1]))
 
 

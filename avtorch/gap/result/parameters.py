@@ -84,24 +84,24 @@ def renamed(average: ModelAverage, own: Sequence[OwnRandom], names: Collection[s
         chances: dict[str, float] = {}
         best: dict[str, Weight] = {}
         for label, p in average.probabilities.items():
-            parts = label.split("+")
-            if each.like not in parts:
-                chances[label] = chances.get(label, 0.0) + p
-                continue
-            new = "+".join(sorted(each.kind.name if n == each.like else n for n in parts))
-            chances[new] = chances.get(new, 0.0) + (0.5 * p if keeps else p)
-            if keeps:
-                chances[label] = 0.5 * p
+            new = _with_name(label, each)
+            moves = 0.0 if new == label else 0.5 if keeps else 1.0
+            for to, share in ((new, moves), (label, 1.0 - moves)):
+                if share > 0:
+                    chances[to] = chances.get(to, 0.0) + share * p
         for label, w in average.best.items():
-            parts = label.split("+")
-            if each.like in parts:
-                new = "+".join(sorted(each.kind.name if n == each.like else n for n in parts))
+            new = _with_name(label, each)
+            if new != label:
                 best[new] = replace(w, label=new)
-            if each.like not in parts or keeps:
+            if new == label or keeps:
                 best[label] = w
         ordered = dict(sorted(chances.items(), key=lambda kv: -kv[1]))
         average = replace(average, probabilities=ordered, best=best)
     return average
+
+
+def _with_name(label: str, own: OwnRandom) -> str:
+    return "+".join(sorted(own.kind.name if n == own.like else n for n in label.split("+")))
 
 
 class ParameterPosterior:
@@ -222,8 +222,7 @@ class ParameterPosterior:
         if ("outliers" in self.names or "outliers" in likes) and found is not None:
             count, rows = max(len(found.starts), 1), len(data.time)
             errors = found.errors[found.starts] if len(found.starts) else np.ones(1)
-            noise = 1.4826 * float(np.median(np.abs(np.diff(found.errors)))) / math.sqrt(2)
-            scale = float(np.sqrt((errors**2).mean())) / max(noise, 1e-9)
+            scale = float(np.sqrt((errors**2).mean())) / max(self._noise_sd(), 1e-9)
             out["outliers"] = {
                 "fraction": _log_normal(count / rows, 1 / math.sqrt(count)),
                 "scale": _log_normal(scale, 1 / math.sqrt(2 * count)),
@@ -233,14 +232,16 @@ class ParameterPosterior:
                 out[each.kind.name] = {own: out[each.like][key] for key, own in each.parameters.items()}
         return {name: x for name, x in out.items() if name in self.names}
 
+    def _noise_sd(self) -> float:
+        """Standard deviation [m/s²] of the accelerometer's noise beside outliers; 0 where none were looked for."""
+        found = self.weight.examined.outliers
+        return 0.0 if found is None else 1.4826 * float(np.median(np.abs(np.diff(found.errors)))) / math.sqrt(2)
+
     def _random_effects(self) -> list[Effect]:
         sizes = {name: {key: q.mean for key, q in own.items()} for name, own in self._random().items()}
         kinds: dict[str, type[Effect]] = {"gust": Gust, "outliers": Outliers}
         kinds |= {each.kind.name: each.kind for each in self._own}
-        found = self.weight.examined.outliers
-        noise = 0.0
-        if found is not None:
-            noise = 1.4826 * float(np.median(np.abs(np.diff(found.errors)))) / math.sqrt(2)
+        noise = self._noise_sd()
         out: list[Effect] = []
         for name, own in sizes.items():
             if name == "road_grade":

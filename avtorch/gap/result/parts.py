@@ -13,16 +13,14 @@ from typing import Any
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.answer.budget import LIKELY
-from avtorch.gap.answer.location import Location
 from avtorch.gap.engine.average import ModelAverage, Weight, free_form_response
 from avtorch.gap.engine.coordinates import EFFECTS, base_name
 from avtorch.gap.engine.family import FORMS, family_of
-from avtorch.gap.engine.force_map import ForceMap
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.priors import TEMPER
 from avtorch.gap.engine.search import Search
-from avtorch.gap.quantity import Quantity
+from avtorch.gap.quantity import Quantity, of_fields
+from avtorch.gap.result.budget import LIKELY, Location
 from avtorch.gap.result.hypotheses import LEAST_LISTED, part_probability
 from avtorch.gap.result.parameters import ParameterPosterior
 from avtorch.io.units import GRAVITY
@@ -35,12 +33,8 @@ class AnswerPart:
     """A part of what the simulator lacks: `name` of an effect, None of a free form; its `family`; `form` of a free one.
 
     `size_mps2`: root mean square of what it adds to the acceleration or to the rate of the speed, None where that is
-    not measured. `force_map`: the curve of a force map. `where` a free form acts, in time, speed, command, frequency.
+    not measured. `where` a free form acts, in time, speed, command, frequency.
 
-    Example:
-        >>> from avtorch.gap.result.parts import AnswerPart
-        >>> AnswerPart(None, "force map", "F(u, v)", None, 0.98).to_dict()["name"] is None
-        True
     """
 
     name: str | None
@@ -48,19 +42,11 @@ class AnswerPart:
     form: str | None
     size_mps2: Quantity | None
     probability: float
-    force_map: ForceMap | None = field(default=None, repr=False)
     where: tuple[Location, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """An entry of `parts` in `diagnosis.json`."""
-        return {
-            "name": self.name,
-            "family": self.family,
-            "form": self.form,
-            "size_mps2": None if self.size_mps2 is None else self.size_mps2.to_dict(),
-            "probability": self.probability,
-            "where": [place.to_dict() for place in self.where],
-        }
+        return of_fields(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,18 +98,13 @@ def parts_of(
     if weight is not None and present >= LEAST_LISTED:
         h = weight.examined.hypothesis
         form = max(average.force_maps, key=lambda name: average.force_maps[name])
-        parts.append(AnswerPart(None, "force map", form, map_size(h, seed), present, h.force_map))
+        parts.append(AnswerPart(None, "force map", form, map_size(h, seed), present))
     for form, probability in sorted(average.parts.items(), key=lambda kv: -kv[1]):
         if probability >= LEAST_LISTED:
             own = unnamed is not None and unnamed.form == form
             size = Quantity(unnamed.size_mps2, 0.0, *2 * [unnamed.size_mps2]) if own and unnamed is not None else None
-            parts.append(AnswerPart(None, family_of(form), form, size, probability, None, where if own else ()))
+            parts.append(AnswerPart(None, family_of(form), form, size, probability, where if own else ()))
     return tuple(parts)
-
-
-def force_map_of(parts: Sequence[AnswerPart]) -> ForceMap | None:
-    """The force map of parts in which it is likely."""
-    return next((p.force_map for p in parts if p.force_map is not None and p.probability >= LIKELY), None)
 
 
 def said_of_unnamed(parts: Sequence[AnswerPart], unknown: bool = False, epoch_s: float = 0.0) -> str:

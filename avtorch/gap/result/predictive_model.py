@@ -115,17 +115,11 @@ def predictive_models(
     names: Sequence[str] = [n for n in verdict.alias_set if n in posteriors]
     if (len(names) < 2 and len(verdict.alias_set) > 1) or verdict.abstained:
         others = [n for n in posteriors if n not in names]
-        # models that differ only in a random effect predict the same
-        names = _apart([posteriors[n] for n in [*names, *others]])[: len(names) + _STAND_IN]
+        apart: dict[frozenset[str], str] = {}  # models that differ only in a random effect predict the same
+        for n in [*names, *others]:
+            apart.setdefault(frozenset(posteriors[n].effects), posteriors[n].weight.label)
+        names = list(apart.values())[: len(names) + _STAND_IN]
     if not names:
         return ()
     noise = NoiseSpectrum.of(posteriors[names[0]].weight.examined.hypothesis)
     return tuple(PredictiveModel.of(posteriors[n], baseline, noise) for n in names[:MOST_MODELS])
-
-
-def _apart(posteriors: Sequence[ParameterPosterior]) -> list[str]:
-    """Names of the models whose rollouts differ from those of every earlier one."""
-    out: dict[frozenset[str], str] = {}
-    for p in posteriors:
-        out.setdefault(frozenset(p.effects), p.weight.label)
-    return list(out.values())

@@ -9,9 +9,10 @@ identification (Ljung, System Identification, 2nd ed., 1999, Sec. 16.6).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import correlate, get_window
+from scipy.signal import correlate, welch
 from scipy.special import chdtri, stdtrit
 
 from avtorch.arrays import FloatArray, IntArray
@@ -35,15 +36,6 @@ class Residuals:
     `time` [s] from the log's start, `command` [m/s²] and `speed` [m/s], None where it was not measured, all (row,);
     `stretch` (row,) numbers stretches without gaps and `step` is the time between their rows [s].
 
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.gap.result.residuals import Residuals
-        >>> from avtorch.gap.result.traces import Traces
-        >>> time, u = np.arange(0.0, 60.0, 0.05), np.zeros(1200)
-        >>> traces = Traces(time, u, ("accel",), u[None] + 0.3, u[None], u[None] + 0.2, u, u.astype(int))
-        >>> left = Residuals.of(traces)
-        >>> round(float(left.before.mean()), 2), round(float(left.after.mean()), 2)
-        (0.3, 0.1)
     """
 
     channel: str
@@ -92,18 +84,17 @@ class Residuals:
     def spectrum(self, residual: FloatArray) -> Spectrum | None:
         """Power of `residual` (row,) over frequency; None where no stretch is long enough."""
         size = max(8, round(_SEGMENT_S / self.step))
-        window = np.asarray(get_window("hann", size), float)
-        power = []
+        count, total, frequency = 0, np.zeros(size // 2 + 1), np.zeros(0)
         for rows in self._stretches():
-            for begin in range(0, len(rows) - size + 1, size // 2):
-                part = residual[rows[begin : begin + size]]
-                power.append(np.abs(np.fft.rfft(window * (part - part.mean()))) ** 2)
-        if not power:
+            if parts := (len(rows) - size) // (size // 2) + 1 if len(rows) >= size else 0:
+                frequency, power = welch(residual[rows], 1 / self.step, nperseg=size, noverlap=size - size // 2)
+                count, total = count + parts, total + parts * power
+        if not count:
             return None
-        mean = np.mean(power, 0)[1:] * 2 * self.step / (window**2).sum()
-        freedom = max(2.0, _OVERLAPPED * len(power))
+        mean = total[1:] / count
+        freedom = max(2.0, _OVERLAPPED * count)
         low, high = (freedom / chdtri(freedom, p) for p in (0.05, 0.95))
-        return Spectrum(np.asarray(np.fft.rfftfreq(size, self.step)[1:], np.float64), mean, mean * low, mean * high)
+        return Spectrum(frequency[1:], mean, mean * low, mean * high)
 
     def correlation(self, residual: FloatArray, *, seconds: float = 5.0) -> Correlation:
         """Of `residual` (row,) with the command a lag earlier, from -1 s (a later command) to `seconds`."""
@@ -150,8 +141,7 @@ def _products(u: FloatArray, e: FloatArray, parts: list[IntArray], least: int, m
     return total
 
 
-@dataclass(frozen=True)
-class BinnedMeans:
+class BinnedMeans(NamedTuple):
     """Bins (bin,): their mean place, the residual's mean [m/s²] and its central 90 %, NaN where blocks are too few."""
 
     place: FloatArray
@@ -160,8 +150,7 @@ class BinnedMeans:
     high: FloatArray
 
 
-@dataclass(frozen=True)
-class Spectrum:
+class Spectrum(NamedTuple):
     """Power density [(m/s²)²/Hz] over `frequency` [Hz], each (frequency,), with its central 90 %."""
 
     frequency: FloatArray
@@ -170,8 +159,7 @@ class Spectrum:
     high: FloatArray
 
 
-@dataclass(frozen=True)
-class Correlation:
+class Correlation(NamedTuple):
     """Correlation (lag,) [-] over `lag` [s]; within ± `band` lie 99 % where the two signals are independent."""
 
     lag: FloatArray

@@ -2,18 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol
-
-from avtorch.gap.answer.budget import Budget, listing
-from avtorch.gap.answer.location import Location
-from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.free_form import FreeForm
-from avtorch.gap.result.gap_budget import Shrinkage
-from avtorch.gap.result.gap_size import GapSize
-from avtorch.gap.result.hypotheses import Candidate, Scope, Verdict
-from avtorch.gap.result.log_facts import LogFacts
-from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
+from avtorch.gap.result.budget import listing
+from avtorch.gap.result.findings import Findings
+from avtorch.gap.result.hypotheses import Scope
 from avtorch.gap.simulator.effect import EFFECTS, named_cause
 from avtorch.io.clock import clock_words
 
@@ -27,47 +18,6 @@ _MEASURES = {
     "rollout_rmse_accel": ("acceleration", "m/s²"),
     "rollout_rmse_speed": ("speed", "m/s"),
 }
-
-
-class Findings(Protocol):
-    """The input of the sentences; a `Diagnosis` has it."""
-
-    @property
-    def log(self) -> LogFacts: ...
-    @property
-    def baseline(self) -> Mapping[str, Quantity]: ...
-    @property
-    def gap(self) -> GapSize: ...
-    @property
-    def budget(self) -> Budget | None: ...
-    @property
-    def verdict(self) -> Verdict: ...
-    @property
-    def winner(self) -> Candidate: ...
-    @property
-    def onset_s(self) -> float | None: ...
-    @property
-    def onset_from_start_s(self) -> float | None: ...
-    @property
-    def onset_log(self) -> int: ...
-    @property
-    def where(self) -> tuple[Location, ...]: ...
-    @property
-    def shrinkage(self) -> Shrinkage | None: ...
-    @property
-    def remaining(self) -> tuple[Candidate, ...] | None: ...
-    @property
-    def next_experiment(self) -> Mapping[str, Any] | None: ...
-    @property
-    def setting(self) -> Mapping[str, Any] | None: ...
-    @property
-    def complete(self) -> bool: ...
-    @property
-    def scope(self) -> Scope | None: ...
-    @property
-    def tested(self) -> SimulatorUnderTest | None: ...
-    @property
-    def free_form(self) -> FreeForm | None: ...
 
 
 def headline(found: Findings) -> str:
@@ -316,7 +266,7 @@ def gap(found: Findings) -> list[str]:
         return []
     lines = [f"Gap of the baseline simulator{_over(gap.horizon_s)}: {', '.join(parts)}."]
     if gap.repeats is not None:
-        alike = [("accelerations", gap.repeats.accel, "m/s²"), ("speeds", gap.repeats.speed, "m/s")]
+        alike = [("accelerations", gap.repeats.floor_accel, "m/s²"), ("speeds", gap.repeats.floor_speed, "m/s")]
         spreads = " and ".join(f"{name} to {x:.2g} {unit}" for name, x, unit in alike if x is not None)
         again = f"Under repeated commands ({gap.repeats.seconds:.0f} s) the car repeats {spreads}"
         lines.append(f"{again}; this spread is noise, or does not depend on the commands.")

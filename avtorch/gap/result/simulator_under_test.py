@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
-from avtorch.gap.quantity import Quantity, unit_of, words_of
+from avtorch.gap.quantity import Quantity, of_fields, unit_of, words_of
 from avtorch.gap.simulator.plant import GapPlant
 
 SAME_KIND = 0.1
@@ -24,11 +24,6 @@ class ParameterDifference:
 
     `differs`: surely, and by more than matters. `own`: it is one of the simulator's own, by its user's name.
 
-    Example:
-        >>> from avtorch.gap.quantity import Quantity
-        >>> from avtorch.gap.result.simulator_under_test import ParameterDifference
-        >>> print(ParameterDifference("T_L", 0.4, Quantity(0.82, 0.02, 0.79, 0.85), differs=True))
-        T_L 0.40 s, on the car 0.82 s (0.79 to 0.85)
     """
 
     name: str
@@ -47,9 +42,6 @@ class ParameterDifference:
         own, mean, low, high = map(shown, (self.simulator, self.car.mean, self.car.q05, self.car.q95))
         return f"{words} {own}{unit}, on the car {mean}{unit} ({low} to {high})"
 
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class SimulatorUnderTest:
@@ -62,12 +54,6 @@ class SimulatorUnderTest:
     one of its own differs, the surrogate is that of the simulator with the car's values. `missing`: effects of the
     verdict that it does not have. `rollouts`: how often the simulator was driven through the drives to fit its own.
 
-    Example:
-        >>> from avtorch.gap import plant
-        >>> from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
-        >>> facts = SimulatorUnderTest("sim.csv", "output", (0.0,), plant([]), {"speed": 0.001}, {"speed": 0.12})
-        >>> facts.to_dict()["surrogate"]["T_L"], facts.wrong
-        (0.3, ())
     """
 
     name: str
@@ -86,21 +72,12 @@ class SimulatorUnderTest:
         return tuple(p for p in self.parameters if p.differs)
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            "name": self.name,
-            "source": self.source,
-            "offset_s": list(self.offset_s),
-            "surrogate": {
-                "effects": {
-                    effect: {key: float(x) for key, x in values.items() if x.dim() == 0}
-                    for effect, values in self.surrogate.report().items()
-                },
-                "T_L": float(self.surrogate.T_L),
-                "K_L": float(self.surrogate.K_L),
-                "left": dict(self.left),
-            },
-            "rollout_10s": dict(self.rollout),
-            "parameters": [p.to_dict() for p in self.parameters],
-            "missing": list(self.missing),
-            "rollouts": self.rollouts,
+        car = self.surrogate
+        effects = {
+            effect: {key: float(x) for key, x in values.items() if x.dim() == 0}
+            for effect, values in car.report().items()
         }
+        own = {"effects": effects, "T_L": float(car.T_L), "K_L": float(car.K_L)}
+        out = of_fields(self)
+        out |= {"surrogate": own | {"left": out.pop("left")}, "rollout_10s": out.pop("rollout")}
+        return out

@@ -1,15 +1,46 @@
-"""The drives as used in the search, with the simulator's rollouts before and after the repair."""
+"""The drives as used in the search: rollouts before and after the repair, what did not count, alarms of a monitor."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
+from typing import Literal, Self
 
 import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
-from avtorch.gap.answer.budget import BEGIN_S, HORIZON_S
-from avtorch.gap.result.uncounted import Uncounted
+from avtorch.gap.drive_record import MeasuredRows
+from avtorch.gap.result.budget import BEGIN_S, HORIZON_S
+from avtorch.io import Log
+
+Reason = Literal["driver", "standstill", "gap", "settling"]
+_REASONS: tuple[Reason, ...] = ("driver", "standstill", "settling")
+
+
+@dataclass(frozen=True)
+class Uncounted:
+    """From `begin` to `end` [s from the start of its log] nothing counted, because of `why`; `log`: which of the logs
+    that have rows that count, from 0.
+
+    "driver": the command was not in force; "standstill"; "gap": no rows; "settling": the first seconds of a drive and
+    of each return to the command, whose state is not known, and pieces too short to count.
+    """
+
+    begin: float
+    end: float
+    why: Reason
+    log: int = 0
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """An alarm of `detector` that began `at` [s] from the start of log number `log`, when its window ended."""
+
+    at: float
+    detector: str
+    log: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +61,18 @@ class Traces:
     does: FloatArray = field(repr=False)
     stretch: IntArray = field(repr=False)
     uncounted: tuple[Uncounted, ...] = field(default=(), repr=False)
+
+    @classmethod
+    def of(
+        cls, rows: MeasuredRows, before: FloatArray, after: FloatArray, does: FloatArray, logs: Sequence[Log] = ()
+    ) -> Self:
+        """Of counted rows; `before`, `after` (channel, row, group): the simulator's. `logs`: for what did not count."""
+        at = rows.source
+        measured, before, after = (x.mean(-1) for x in (rows.measured, before, after))
+        left_out = uncounted(logs, rows) if logs else ()
+        return cls(
+            rows.time[at], rows.command[at], rows.channels, measured, before, after, does, rows.stretch, left_out
+        )
 
     @property
     def step(self) -> float:
@@ -83,3 +126,29 @@ class Traces:
         error = np.linalg.norm(self.measured - self.begun_anew(simulated), axis=1)
         spread = np.linalg.norm(self.measured - self.measured.mean(axis=1, keepdims=True), axis=1)
         return 100 * (1 - np.divide(error, spread, out=np.full_like(error, np.nan), where=spread > 0))
+
+
+def uncounted(logs: Sequence[Log], record: MeasuredRows) -> tuple[Uncounted, ...]:
+    """What `record`, made of these `logs`, does not count, in order of time."""
+    found: list[Uncounted] = []
+    for number, counted in enumerate(np.unique(record.log[record.source]).tolist()):
+        log = logs[counted]
+        own = record.source[record.log[record.source] == counted]
+        why = np.full(log.rows, _REASONS.index("settling"))
+        # averaged rows: from the stamp of the first of each to the next
+        last = np.searchsorted(record.time[own], log.elapsed + 1e-6 * record.dt, side="right") - 1
+        why[(last >= 0) & (log.elapsed - record.time[own][last] < (1 - 1e-3) * record.dt)] = -1
+        why[(why >= 0) & ~log.moving] = _REASONS.index("standstill")
+        why[(why >= 0) & ~log.engaged] = _REASONS.index("driver")
+        for part, after in pairwise([*log.segments(), None]):
+            assert part is not None
+            edges = [part.start, *(np.flatnonzero(np.diff(why[part])) + 1 + part.start).tolist(), part.stop]
+            for a, b in pairwise(edges):
+                if why[a] >= 0:
+                    end = log.elapsed[min(b, part.stop - 1)]
+                    found.append(Uncounted(float(log.elapsed[a]), float(end), _REASONS[why[a]], number))
+            if after is not None:
+                ends = float(log.elapsed[part.stop - 1]), float(log.elapsed[after.start])
+                if ends[1] - ends[0] > 2 * record.dt:
+                    found.append(Uncounted(*ends, "gap", number))
+    return tuple(found)

@@ -224,5 +224,3 @@ def test_an_answer_says_its_parts() -> None:
     # the simulator that comes back carries a free form, or what it leaves does not pass for noise
     assert answer.budget is not None
     assert answer.free_form is not None or answer.budget.unexplained.rest(answer.budget.material) != "noise"
-    assert answer.force_map is not None
-    assert answer.force_map.table.shape == (len(answer.force_map.knots_u), len(answer.force_map.knots_v))

@@ -16,17 +16,11 @@ import torch
 
 from avtorch.errors import InputError
 from avtorch.gap import AerodynamicDrag, DeadTime, GapPlant, RoadGrade, Saturation, plant
-from avtorch.gap.quantity import unit_of, words_of
-from avtorch.gap.result.diagnosis import (
-    Candidate,
-    Diagnosis,
-    GapSize,
-    LogFacts,
-    Quantity,
-    Verdict,
-    candidate_name,
-    listed_candidates,
-)
+from avtorch.gap.quantity import Quantity, unit_of, words_of
+from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.gap_size import GapSize
+from avtorch.gap.result.hypotheses import Candidate, Verdict, candidate_name, listed_candidates
+from avtorch.gap.result.log_facts import LogFacts
 from avtorch.io import Log
 from tests.faulty_disk import visible
 from tests.gap.verdicts import verdict_of
@@ -87,13 +81,6 @@ def test_quantity_of_draws() -> None:
     assert q.sd == pytest.approx(draws.std(ddof=1))
     assert (q.q05, q.q95) == (50, 950)
     assert Quantity.of_draws(torch.tensor([2.0])) == Quantity(2.0, 0.0, 2.0, 2.0)
-
-
-def test_quantity_of_a_normal() -> None:
-    q, z = Quantity.of_normal(-0.5, 0.1), 1.6448536269514722
-    assert (q.mean, q.sd) == (-0.5, 0.1)
-    assert (q.q05, q.q95) == pytest.approx((-0.5 - 0.1 * z, -0.5 + 0.1 * z), rel=1e-12)
-    assert q.scaled(2.0).to_dict() == pytest.approx(Quantity.of_normal(-1.0, 0.2).to_dict())
 
 
 @pytest.mark.parametrize("bad", [(math.nan, 1, 0, 1), (0, -1, 0, 1), (0, 1, 1, 0), (0, math.inf, 0, 1)])

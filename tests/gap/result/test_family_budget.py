@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from avtorch import diagnose
-from avtorch.gap import BrakeThrottleAsymmetry, Budget, GainChange, SensorBias
+from avtorch.gap import BrakeThrottleAsymmetry, GainChange, SensorBias
+from avtorch.gap.result.budget import Budget
 from tests.gap.cars import log_of
 
 BIAS = 0.3  # [m/s²]

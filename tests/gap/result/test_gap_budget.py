@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+import avtorch
 from avtorch.errors import InputError
-from avtorch.gap import Budget, ConstantResistance, DeadBand, DeadTime, Effect, SensorBias, gap_budget
+from avtorch.gap import ConstantResistance, DeadBand, DeadTime, Effect, SensorBias
+from avtorch.gap.result.budget import Budget
 from tests.gap.cars import log_of
 
 FEW = ["dead_time", "dead_band", "constant_resistance", "sensor_bias", "sensor_scale", "gust"]
 """With the gust: the noise of `log_of` has a slow force, which is an unknown cause where no gust may be."""
+
+
+def budget_of(log: avtorch.Log, **more: Any) -> Budget:
+    budget = avtorch.diagnose(log, **more).budget
+    assert budget is not None
+    return budget
 
 
 def sums_to_one(budget: Budget) -> None:
@@ -35,7 +45,7 @@ def sums_to_one(budget: Budget) -> None:
     ids=lambda x: getattr(x, "name", None),
 )
 def test_a_single_cause_is_the_whole_budget(effect: Effect, key: str, within: float, fresh_seed: int) -> None:
-    budget = gap_budget(log_of([effect], seed=fresh_seed), effects=FEW)
+    budget = budget_of(log_of([effect], seed=fresh_seed), effects=FEW)
     (part,) = budget.parts
     assert part.name == effect.name
     assert part.parameters[key].mean == pytest.approx(getattr(effect, key), abs=within)
@@ -47,7 +57,7 @@ def test_a_single_cause_is_the_whole_budget(effect: Effect, key: str, within: fl
 @pytest.mark.slow
 def test_parts_and_what_is_unexplained_sum_to_one(fresh_seed: int) -> None:
     log = log_of([DeadTime(0.3), SensorBias(0.2)], seed=fresh_seed)
-    budget = gap_budget(log, effects=FEW)
+    budget = budget_of(log, effects=FEW)
     assert {part.name for part in budget.parts} == {"dead_time", "sensor_bias"}
     sums_to_one(budget)
     assert budget.before > budget.left >= 1.0
@@ -55,7 +65,7 @@ def test_parts_and_what_is_unexplained_sum_to_one(fresh_seed: int) -> None:
 
 
 def test_without_a_cause_all_is_unexplained() -> None:
-    budget = gap_budget(log_of(seconds=40.0), effects=["dead_time"])
+    budget = budget_of(log_of(seconds=40.0), effects=["dead_time"])
     sums_to_one(budget)
     assert budget.parts == ()
     assert budget.unexplained.share.mean == 1.0
@@ -64,7 +74,7 @@ def test_without_a_cause_all_is_unexplained() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(4))
 def test_coloured_noise_is_no_cause(number: int, fresh_seed: int) -> None:
-    budget = gap_budget(log_of(seed=fresh_seed + number), effects=FEW)
+    budget = budget_of(log_of(seed=fresh_seed + number), effects=FEW)
     assert budget.parts == ()
     assert "unknown" not in budget.verdict
 
@@ -72,15 +82,15 @@ def test_coloured_noise_is_no_cause(number: int, fresh_seed: int) -> None:
 @pytest.mark.slow
 def test_the_same_log_has_the_same_budget(fresh_seed: int) -> None:
     log = log_of([DeadBand(0.25)], seed=fresh_seed, seconds=60.0)
-    assert gap_budget(log, effects=FEW).to_dict() == gap_budget(log, effects=FEW).to_dict()
+    assert budget_of(log, effects=FEW).to_dict() == budget_of(log, effects=FEW).to_dict()
 
 
 def test_wrong_arguments_are_refused() -> None:
     log = log_of(seconds=60.0)
     for material in (0.0, 1.0, float(np.nan)):
         with pytest.raises(InputError, match="material"):
-            gap_budget(log, material=material)
+            budget_of(log, material=material)
     with pytest.raises(InputError, match="perhaps dead_time"):
-        gap_budget(log, effects=["dead_tim"])
+        budget_of(log, effects=["dead_tim"])
     with pytest.raises(InputError, match="needs 12 s"):
-        gap_budget(log_of(seconds=7.0), effects=FEW)
+        budget_of(log_of(seconds=7.0), effects=FEW)

@@ -7,10 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from avtorch.gap import EFFECTS, Budget, ChannelError, Part, Unexplained
+from avtorch.gap import EFFECTS
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.diagnosis import Diagnosis, GapSize, LogFacts
+from avtorch.gap.result.budget import Budget, ChannelError, Part, Unexplained
+from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.gap_size import GapSize
 from avtorch.gap.result.hypotheses import Candidate, Verdict, candidate_name
+from avtorch.gap.result.log_facts import LogFacts
 
 NAMES = (
     "sensor_lag",

@@ -22,7 +22,8 @@ from tests.gap.records import Noise, log_of
 
 def about(mean: float, share: float = 0.05) -> Quantity:
     """Known to a share of itself."""
-    return Quantity.of_normal(mean, share * abs(mean))
+    half = 1.645 * share * abs(mean)
+    return Quantity(mean, share * abs(mean), mean - half, mean + half)
 
 
 def said_everywhere(found: Diagnosis, reason: str) -> None:

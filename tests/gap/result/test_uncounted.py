@@ -7,7 +7,7 @@ import pytest
 
 from avtorch import Log
 from avtorch.gap.drive_record import Record
-from avtorch.gap.result.uncounted import uncounted
+from avtorch.gap.result.traces import uncounted
 
 
 def drive(rate: float, *, taken: bool = True) -> Log:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import pytest
 
 from avtorch.gap import EFFECTS, DeadTime, Effect, register
-from avtorch.gap.answer.budget import Budget, ChancePart, ChannelError, Part, Unexplained
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.budget import Budget, ChancePart, ChannelError, Part, Unexplained
 from avtorch.gap.simulator.effect import cause_words, named_cause
 
 

@@ -1,13 +1,12 @@
-"""The result of a budget: its parts, random causes, what is unexplained, and the sentence a person reads."""
+"""The gap's budget: its parts, random causes, what is unexplained and where, and the sentence a person reads."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
-from avtorch.gap.answer.location import Location
-from avtorch.gap.quantity import Quantity
+from avtorch.gap.quantity import Quantity, of_fields, plain
 from avtorch.gap.simulator.effect import named_cause
 
 HORIZON_S = 10.0
@@ -19,6 +18,40 @@ MATERIAL = 0.03
 unexplained of the gap."""
 LIKELY = 0.5
 """Probability from which a part is named."""
+Axis = Literal["time", "speed", "command", "frequency", "signal"]
+
+UNITS: dict[Axis, str] = {"time": "s", "speed": "m/s", "command": "m/s²", "frequency": "Hz", "signal": ""}
+
+
+@dataclass(frozen=True)
+class Location:
+    """A part of the gap: `begin` to `end` on an `axis`, with its `share` of the cause's contribution.
+
+    Times are on the log's own clock [s], the others [m/s, m/s², Hz]; on the axis `signal` both are `"actuation"` (the
+    car's motion differs) or `"sensing"` (the accelerometer's reading differs). `q_value`: the false-discovery rate at
+    which all parts with a q-value as small are named.
+    """
+
+    axis: Axis
+    begin: float | str
+    end: float | str
+    share: float
+    q_value: float
+
+    def words(self, epoch_s: float = 0.0) -> str:
+        """The part as a phrase; times count from `epoch_s`, the log's start on its own clock."""
+        if isinstance(self.begin, str) or isinstance(self.end, str):
+            return "in the car's motion" if self.begin == "actuation" else "in the accelerometer's reading"
+        if self.axis == "time":
+            return f"from {self.begin - epoch_s:.1f} to {self.end - epoch_s:.1f} s after the log's start"
+        at, unit = "frequencies" if self.axis == "frequency" else f"{self.axis}s", UNITS[self.axis]
+        ends = f"from {self.begin:.2g} to {self.end:.2g}" if self.begin else f"below {self.end:.2g}"
+        return f"at {at} {ends} {unit}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `where` in `diagnosis.json`."""
+        part = {"axis": self.axis, "from": self.begin, "to": self.end}
+        return part | {"share": self.share, "q_value": self.q_value}
 
 
 @dataclass(frozen=True)
@@ -28,14 +61,6 @@ class Part:
     `alias_set`: effects that these drives cannot distinguish from it, itself among them. `probability`: that one of
     them is really there. `onset_s` on the log's own clock, None: from the start. `plausible`: its parameters are
     physically possible.
-
-    Example:
-        >>> from avtorch.gap import Part
-        >>> from avtorch.gap.quantity import Quantity
-        >>> share, size = Quantity(0.6, 0.05, 0.5, 0.7), Quantity(0.31, 0.02, 0.28, 0.34)
-        >>> part = Part("sensor_bias", ("sensor_bias",), 0.97, share, 1.2, {"bias_mps2": size})
-        >>> part.to_dict()["names"], part.to_dict()["share"]["mean"]
-        (['sensor_bias'], 0.6)
     """
 
     name: str
@@ -48,16 +73,9 @@ class Part:
     plausible: bool = True
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            "names": [self.name],
-            "alias_set": list(self.alias_set),
-            "probability": self.probability,
-            "share": _interval(self.share),
-            "after": self.after,
-            "parameters": {key: value.to_dict() for key, value in self.parameters.items()},
-            "onset_s": self.onset_s,
-            "plausible": self.plausible,
-        }
+        out = of_fields(self)
+        del out["share"]["sd"]
+        return {"names": [out.pop("name")]} | out
 
 
 @dataclass(frozen=True)
@@ -65,19 +83,14 @@ class ChancePart:
     """A random cause, such as a gust: no rollout predicts it, so it is a part of the noise.
 
     `share_of_noise`: of the variance that is left with all parts (outliers: of the accelerometer's errors); None where
-    it was not estimated. `alias_set`: effects
-    that these drives cannot distinguish from it, itself among them (it is added).
-
-    Example:
-        >>> from avtorch.gap import ChancePart
-        >>> ChancePart("gust", 0.97, alias_set=("road_grade",)).to_dict()["alias_set"]
-        ['gust', 'road_grade']
+    it was not estimated. `alias_set`: effects that these drives cannot distinguish from it, itself among them (it is
+    added).
     """
 
     name: str
     probability: float
     share_of_noise: float | None = None
-    parameters: Mapping[str, Quantity] | None = None
+    parameters: Mapping[str, Quantity] = field(default_factory=dict)
     plausible: bool = True
     alias_set: tuple[str, ...] = ()
 
@@ -85,14 +98,8 @@ class ChancePart:
         object.__setattr__(self, "alias_set", tuple(sorted({self.name, *self.alias_set})))
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            "names": [self.name],
-            "alias_set": list(self.alias_set),
-            "probability": self.probability,
-            "share_of_noise": self.share_of_noise,
-            "parameters": {key: value.to_dict() for key, value in (self.parameters or {}).items()},
-            "plausible": self.plausible,
-        }
+        out = of_fields(self)
+        return {"names": [out.pop("name")]} | out
 
 
 @dataclass(frozen=True)
@@ -106,11 +113,6 @@ class FamilyShare:
 
     `excited`: whether an effect of the family would have shown at its typical size. `unseen_mps2`: the root mean square
     that the least visible of its effects could have without showing; None where only chance acts.
-
-    Example:
-        >>> from avtorch.gap.answer.budget import FamilyShare
-        >>> FamilyShare("time", probability=0.02, excited=True, unseen_mps2=0.04).to_dict()["unseen_mps2"]
-        0.04
     """
 
     family: str
@@ -130,17 +132,7 @@ class FamilyShare:
 
     def to_dict(self) -> dict[str, Any]:
         """An entry of `budget.families`."""
-        return {
-            "family": self.family,
-            "names": list(self.names),
-            "form": self.form,
-            "hidden": list(self.hidden),
-            "probability": self.probability,
-            "size_mps2": None if self.size_mps2 is None else _interval(self.size_mps2),
-            "takes_off": None if self.takes_off is None else _interval(self.takes_off),
-            "excited": self.excited,
-            "unseen_mps2": self.unseen_mps2,
-        }
+        return of_fields(self, intervals=True)
 
 
 @dataclass(frozen=True)
@@ -152,12 +144,6 @@ class Unexplained:
     much of it but is not certain enough to be named. `still`: the share of the squared error left that a black box
     takes off on blocks that taught neither, from what it surely does to what the log could have shown. `carried`: what
     of the gap a force without a name takes off, which the repaired simulator carries; a part of `share`.
-
-    Example:
-        >>> from avtorch.gap import Unexplained
-        >>> from avtorch.gap.quantity import Quantity
-        >>> Unexplained(Quantity(0.2, 0.04, 0.12, 0.27), material=True, probability=0.99).to_dict()["material"]
-        True
     """
 
     share: Quantity
@@ -195,33 +181,16 @@ class Unexplained:
         return "; ".join(x for x in (where, alike) if x)
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            "share": _interval(self.share),
-            "material": self.material,
-            "probability": self.probability,
-            "where": [part.to_dict() for part in self.where],
-            "resembles": self.resembles,
-            "still": None if self.still is None else _interval(self.still),
-            "carried": None if self.carried is None else _interval(self.carried),
-        }
+        return of_fields(self, intervals=True)
 
 
 @dataclass(frozen=True)
 class ChannelError:
-    """Root mean squared error of rollouts in one channel [m/s or m/s²]: before, at the floor, and with all causes.
-
-    Example:
-        >>> from avtorch.gap import ChannelError
-        >>> ChannelError(before=0.5, floor=0.1, left=0.12).to_dict()
-        {'before': 0.5, 'floor': 0.1, 'left': 0.12}
-    """
+    """Root mean squared error of rollouts in one channel [m/s or m/s²]: before, at the floor, and with all causes."""
 
     before: float
     floor: float
     left: float
-
-    def to_dict(self) -> dict[str, float]:
-        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -231,21 +200,6 @@ class Budget:
     `parts` in the order of their shares; these and `unexplained` sum to 1. `baseline`, `repaired`: `T_L` [s] and `K_L`
     [-] without any cause, and with all parts. Where rollouts show no gap, shares mean nothing.
     `horizon_s` [s] of the rollouts: 10 s, or the longest stretch.
-
-    Example:
-        >>> from avtorch import Leader, simulate
-        >>> from avtorch.gap import ConstantResistance, gap_budget, plant
-        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
-        >>> log = simulate(Leader.default(start=30.0, duration=100.0, dt=0.1), plant=dragging).log()
-        >>> budget = gap_budget(log, effects=["constant_resistance"])
-        >>> part = budget.parts[0]
-        >>> part.name, round(part.parameters["resistance_mps2"].mean, 1), budget.verdict
-        ('constant_resistance', 0.2, ('constant_resistance',))
-        >>> print(str(budget).partition(";")[0])
-        Chiefly the car is slowed by 0.2 m/s² at every speed (constant_resistance, 100 % of the gap)
-        >>> speed = budget.by_channel["speed"]
-        >>> speed.before > 3 * speed.left
-        True
     """
 
     before: float
@@ -271,11 +225,6 @@ class Budget:
     def left_above_noise(self) -> float:
         """Share of the squared error that is left, with all parts, which is above the floor; the rest is noise."""
         return max(1.0 - (self.floor / self.left) ** 2, 0.0)
-
-    @property
-    def says_something(self) -> bool:
-        """Whether there is more to tell than that nothing material is missing."""
-        return bool(self.parts or self.chance or self.unexplained.material)
 
     @property
     def verdict(self) -> tuple[str, ...]:
@@ -351,27 +300,19 @@ class Budget:
 
     def to_dict(self) -> dict[str, Any]:
         """The object `budget` of `diagnosis.json`."""
-        return {
+        out = {
             "metric": "rollout_10s_over_floor",
-            "horizon_s": self.horizon_s,
             "heldout_by": "drives" if self.by_drives else "blocks",
-            "before": self.before,
-            "floor": self.floor,
-            "left": self.left,
-            "by_channel": {name: error.to_dict() for name, error in self.by_channel.items()},
-            "parts": [part.to_dict() for part in self.parts],
-            "chance": [part.to_dict() for part in self.chance],
-            "families": [family.to_dict() for family in self.families],
-            "unexplained": self.unexplained.to_dict(),
-            "material": self.material,
         }
+        keys = ("horizon_s", "before", "floor", "left", "by_channel", "parts", "chance", "families", "unexplained")
+        return out | {key: plain(getattr(self, key)) for key in (*keys, "material")}
 
 
 def _words(part: Part | ChancePart, behind: str = "") -> str:
     """A cause in words; by its name alone where its parameters are not those of such an effect."""
     if not part.plausible:
         return f"{part.name} ({f'{behind}, ' if behind else ''}physically implausible as fitted)"
-    return named_cause(part.name, {key: q.mean for key, q in (part.parameters or {}).items()}, behind)
+    return named_cause(part.name, {key: q.mean for key, q in part.parameters.items()}, behind)
 
 
 def listing(names: Sequence[str]) -> str:
@@ -382,7 +323,3 @@ def listing(names: Sequence[str]) -> str:
 def percent(share: float) -> str:
     """A share as it is printed."""
     return "under 1 %" if 0 < share < 0.01 else f"{100 * share:.0f} %"
-
-
-def _interval(share: Quantity) -> dict[str, float]:
-    return {"mean": share.mean, "q05": share.q05, "q95": share.q95}

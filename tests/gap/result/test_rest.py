@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from avtorch.gap import Unexplained
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.budget import Unexplained
 
 
 def rest(q05: float, q95: float) -> str:

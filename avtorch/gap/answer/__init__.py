@@ -1,1 +1,0 @@
-"""What an answer is made of: causes and their probabilities, the budget, where the gap lies, what has changed."""
