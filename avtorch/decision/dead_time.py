@@ -42,11 +42,6 @@ class InferredDeadTime:
         seconds: the most likely one [s], 0 where none is clear (`CLEAR`).
         q05, q95: the central 90 % of its posterior under a flat prior over the dead times tried [s].
         nats: evidence of the most likely one over none.
-
-    Example:
-        >>> from avtorch.decision.dead_time import InferredDeadTime
-        >>> InferredDeadTime(0.0, 0.0, 0.06, 1.2).to_dict()
-        {'seconds': 0.0, 'q05': 0.0, 'q95': 0.06, 'nats': 1.2}
     """
 
     seconds: float

@@ -120,16 +120,7 @@ class FmuSimulator:
         return (*notes, *self._start_notes)
 
     def parameters(self) -> dict[str, float]:
-        """The FMU's numeric parameters with the values of the next drive, in the FMU's own units.
-
-        Example:
-            >>> from avtorch.external import FmuSimulator, write_fmu
-            >>> from avtorch.gap import plant
-            >>> _ = write_fmu(plant(baseline="dead_time=0.2", T_L=0.4), "car.fmu")
-            >>> with FmuSimulator("car.fmu") as car:
-            ...     car.with_parameters({"T_L": 0.5}).parameters()["T_L"]
-            0.5
-        """
+        """The FMU's numeric parameters with the values of the next drive, in the FMU's own units."""
         return {name: self._values.get(name, v.start) for name, v in self._settable().items() if v.start is not None}
 
     def with_parameters(self, values: Mapping[str, float]) -> FmuSimulator:

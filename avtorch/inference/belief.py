@@ -67,14 +67,6 @@ class Belief(Displayed):
         excited: ``(vehicle,)`` bool; where false the window was not used and the rest is carried over unchanged.
         converged: ``(vehicle,)`` bool; false where the window was excited but its chains did not settle: carried over,
             too. In the latent form true means only that the chains agree (see `Posterior`).
-
-    Example:
-        >>> from avtorch.inference import SequentialInference
-        >>> belief = SequentialInference(vehicles=3).belief  # before any window: the first prior
-        >>> belief.names, tuple(belief.draws.shape), belief.excited.tolist()
-        (('T_L', 'K_L', 'sigma'), (1000, 3, 3), [False, False, False])
-        >>> sorted(belief.stat("T_L", vehicle=2))
-        ['mean', 'q05', 'q95', 'sd']
     """
 
     names: tuple[str, ...]

@@ -172,19 +172,7 @@ def weighted_draws(
     generator: torch.Generator | None = None,
     mode: Mode | None = None,
 ) -> WeightedDraws:
-    """Weighted draws from the posterior of every window, with proposals around ``mode``, sought where not given.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import integrate
-        >>> from avtorch.inference.importance import weighted_draws
-        >>> from avtorch.validation import synthetic_windows
-        >>> density = synthetic_windows(2, seed=1).density
-        >>> draws, exact = weighted_draws(density, generator=torch.Generator().manual_seed(0)), integrate(density)
-        >>> lag = (draws.weight[..., None] * draws.z.exp()).sum(0)[:, 0]
-        >>> bool(((lag - exact.mean[:, 0]).abs() < 0.3 * exact.sd[:, 0]).all())
-        True
-    """
+    """Weighted draws from the posterior of every window, with proposals around ``mode``, sought where not given."""
     settings = ImportanceSettings() if settings is None else settings
     nearby = approximated(density)
     mode = find_mode(nearby, from_values=True, tolerance=5e-5) if mode is None else mode

@@ -40,13 +40,6 @@ class Mode:
             the inverse Hessian of the potential. It whitens the posterior for the sampler.
         log_prob: log density at the mode, ``(window,)``.
         converged: where the search ended at a proper maximum, ``(window,)`` bool.
-
-    Example:
-        >>> from avtorch.inference import find_mode
-        >>> from avtorch.validation import synthetic_windows
-        >>> mode = find_mode(synthetic_windows(4, seed=1).density)
-        >>> tuple(mode.z.shape), tuple(mode.covariance.shape), mode.converged.all().item()
-        ((4, 3), (4, 3, 3), True)
     """
 
     z: Float[Tensor, "window parameter"]

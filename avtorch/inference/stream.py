@@ -36,14 +36,6 @@ class Window(Displayed):
         n: usable rows, ``(vehicle,)``.
         belief: see :class:`Belief`; the window was used where ``belief.excited`` and
             ``belief.converged`` hold.
-
-    Example:
-        >>> from avtorch import BeliefStream, GLVDPlant, Leader, simulate
-        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-        >>> rows = {"accel": run.accel[:, 0], "accel_cmd": run.accel_cmd[:, 0], "jerk": run.jerk[:, 0]}
-        >>> stream = BeliefStream(window=2.0, check_units=False, estimator="map")
-        >>> [(w.start_s, w.end_s, w.n.tolist()) for w in stream.feed(run.time, rows)]  # the third is still open
-        [(0.0, 2.0, [100.0])]
     """
 
     start_s: float

@@ -33,15 +33,6 @@ class TorchDensity:
     Raises:
         InputError: for no parameters, a constraint that is not of a single number, a start that breaks one, or a
             device that this machine lacks.
-
-    Example:
-        >>> import torch
-        >>> from torch.distributions import Gamma, constraints
-        >>> from avtorch.inference import TorchDensity, sample
-        >>> rate = TorchDensity(lambda p: Gamma(3.0, 2.0).log_prob(p["rate"]), {"rate": constraints.positive})
-        >>> posterior = sample(rate, generator=torch.Generator().manual_seed(0))
-        >>> posterior.converged.item(), round(posterior.mean.item(), 1)  # 3/2
-        (True, 1.5)
     """
 
     windows = 1

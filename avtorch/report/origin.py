@@ -35,14 +35,6 @@ class Origin:
         """With the hashes of those files, and of those in folders among them, and of `settings`.
 
         Raises `OSError` for a file that cannot be read.
-
-        Example:
-            >>> from pathlib import Path
-            >>> from avtorch.report import Origin
-            >>> _ = Path("lap.csv").write_text("time,accel_cmd,speed")
-            >>> made = Origin.of("avtorch diagnose lap.csv --out out", ["lap.csv"], {"seed": 0})
-            >>> list(made.files), len(made.settings)
-            (['lap.csv'], 64)
         """
         files: dict[str, str] = {}
         for path in map(Path, paths):
@@ -64,13 +56,7 @@ def _free(name: str, taken: Mapping[str, str]) -> str:
 
 
 def versions() -> str:
-    """Of avtorch and of what computes, in one line.
-
-    Example:
-        >>> from avtorch.report.origin import versions
-        >>> versions().split(", ")[0].split()[0]
-        'avtorch'
-    """
+    """Of avtorch and of what computes, in one line."""
     found = {
         "avtorch": __version__,
         "torch": version("torch"),

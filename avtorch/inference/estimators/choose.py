@@ -42,13 +42,6 @@ def make_estimator(name: str, form: Form, *, vehicles: int = 1, **options: Any) 
 
     Raises:
         InputError: for an unknown name, an option that the estimator does not have, or one out of range.
-
-    Example:
-        >>> from avtorch.inference import JerkForm
-        >>> from avtorch.inference.estimators import make_estimator
-        >>> rls = make_estimator("rls", JerkForm(), vehicles=3, forgetting=0.99)
-        >>> type(rls).__name__, tuple(rls.belief.mean.shape)
-        ('RecursiveLeastSquares', (3, 3))
     """
     made = ESTIMATORS.get(name)
     if made is None:

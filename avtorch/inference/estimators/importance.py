@@ -35,16 +35,6 @@ class ImportanceSampling(SequentialInference):
     reliable either, it is sampled by SGLD, with ``settings``.
 
     Takes the arguments of :class:`SequentialInference`.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import JerkDensity
-        >>> from avtorch.inference.estimators import ImportanceSampling
-        >>> from avtorch.validation import synthetic_windows
-        >>> vehicle, window = ImportanceSampling(), synthetic_windows(1, seed=1).density
-        >>> belief = vehicle.update(lambda index, prior: JerkDensity(window.statistics, prior), torch.tensor([True]))
-        >>> belief.converged.item(), round(belief.stat("K_L")["mean"], 2)
-        (True, 0.54)
     """
 
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:

@@ -345,16 +345,7 @@ def _where(on: Tensor, state: GaussianState, other: GaussianState) -> GaussianSt
 
 
 class JointEKF(JointKalman):
-    """One tangent a row: cheap, and overconfident where the belief is wide against the model's curvature.
-
-    Example:
-        >>> from avtorch import BeliefStream, GLVDPlant, Leader, simulate
-        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-        >>> rows = {"accel": run.accel[:, 0], "accel_cmd": run.accel_cmd[:, 0], "jerk": run.jerk[:, 0]}
-        >>> stream = BeliefStream(check_units=False, estimator="ekf", drift=0.02)  # made of JointEKF
-        >>> [round(w.belief.stat("K_L")["mean"], 1) for w in stream.feed(run.time, rows) + stream.flush()]
-        [0.9, 0.9]
-    """
+    """One tangent a row: cheap, and overconfident where the belief is wide against the model's curvature."""
 
     def predict(self, model: StateModel, state: GaussianState, row: Observation) -> GaussianState:
         slope = model.slope(state.mean, row)
@@ -372,16 +363,7 @@ class JointEKF(JointKalman):
 
 
 class JointUKF(JointKalman):
-    """Second order in the mean and no derivatives, at ``2d`` runs of the model a row.
-
-    Example:
-        >>> from avtorch import BeliefStream, GLVDPlant, Leader, simulate
-        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-        >>> rows = {"accel": run.accel[:, 0], "accel_cmd": run.accel_cmd[:, 0], "jerk": run.jerk[:, 0]}
-        >>> stream = BeliefStream(check_units=False, estimator="ukf", drift=0.02)  # made of JointUKF
-        >>> [round(w.belief.stat("K_L")["mean"], 1) for w in stream.feed(run.time, rows) + stream.flush()]
-        [0.9, 0.9]
-    """
+    """Second order in the mean and no derivatives, at ``2d`` runs of the model a row."""
 
     def predict(self, model: StateModel, state: GaussianState, row: Observation) -> GaussianState:
         points = model.advance(sigma_points(state), row)

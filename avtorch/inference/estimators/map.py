@@ -23,16 +23,6 @@ class MaximumAPosteriori(SequentialInference):
     lost.
 
     Takes the arguments of :class:`SequentialInference`; ``settings`` do not apply.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import JerkDensity
-        >>> from avtorch.inference.estimators import MaximumAPosteriori
-        >>> from avtorch.validation import synthetic_windows
-        >>> vehicle, window = MaximumAPosteriori(), synthetic_windows(1, seed=1).density
-        >>> belief = vehicle.update(lambda index, prior: JerkDensity(window.statistics, prior), torch.tensor([True]))
-        >>> belief.converged.item(), round(belief.stat("K_L")["mean"], 2)
-        (True, 0.54)
     """
 
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:

@@ -42,14 +42,6 @@ class RecursiveLeastSquares(WindowedEstimator):
 
     Raises:
         InputError: where jerk is not measured, or for ``forgetting`` out of range.
-
-    Example:
-        >>> from avtorch import BeliefStream, GLVDPlant, Leader, simulate
-        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-        >>> rows = {"accel": run.accel[:, 0], "accel_cmd": run.accel_cmd[:, 0], "jerk": run.jerk[:, 0]}
-        >>> stream = BeliefStream(check_units=False, estimator="rls", forgetting=0.99)  # remembers 100 rows
-        >>> [round(w.belief.stat("T_L")["mean"], 1) for w in stream.feed(run.time, rows) + stream.flush()]
-        [0.5, 0.5]
     """
 
     def __init__(self, form: Form, *, forgetting: float = 0.995, **options: Any) -> None:

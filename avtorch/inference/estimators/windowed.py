@@ -20,13 +20,6 @@ class Estimator(Protocol):
     """Takes the windows of many vehicles one after another and keeps a belief about them.
 
     A window that is not excited leaves the belief of its vehicle as it was.
-
-    Example:
-        >>> from avtorch.inference import JerkForm
-        >>> from avtorch.inference.estimators import Estimator, make_estimator
-        >>> filters: list[Estimator] = [make_estimator(name, JerkForm()) for name in ("ekf", "ukf")]
-        >>> [f.belief.names for f in filters]
-        [('T_L', 'K_L', 'sigma'), ('T_L', 'K_L', 'sigma')]
     """
 
     @property
