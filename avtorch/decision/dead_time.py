@@ -38,10 +38,8 @@ CLEAR = 3.0
 class InferredDeadTime:
     """An inferred dead time.
 
-    Attributes:
-        seconds: the most likely one [s], 0 where none is clear (`CLEAR`).
-        q05, q95: the central 90 % of its posterior under a flat prior over the dead times tried [s].
-        nats: evidence of the most likely one over none.
+    `seconds`: the most likely one [s], 0 where none is clear (`CLEAR`). `q05`, `q95`: the central 90 % of its posterior
+    under a flat prior over the dead times tried [s]. `nats`: evidence of the most likely one over none.
     """
 
     seconds: float

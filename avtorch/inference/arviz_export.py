@@ -27,8 +27,7 @@ def inference_data(
     A unit goes to the variable's ``attrs["units"]``. ArviZ 1.x has ``xarray.DataTree`` in place of ``InferenceData``:
     ``DataTree.from_dict({"posterior": data.posterior})`` carries over.
 
-    Raises:
-        InputError: where ArviZ is not installed, or there are no draws.
+    Raises `InputError` where ArviZ is not installed, or there are no draws.
     """
     if not all(x.size for x in draws.values()) or not draws:
         raise InputError("draws: found none; to_arviz needs posterior draws")

@@ -44,8 +44,7 @@ class Summary(NamedTuple):
     ) -> Summary:
         """Summary of parameters with normal logarithms: moments and quantiles in closed form, and ``kept`` draws.
 
-        Args:
-            mean_z: ``(vehicle, parameter)``. cov_z: ``(vehicle, parameter, parameter)``, positive semidefinite.
+        `mean_z`: ``(vehicle, parameter)``. cov_z: ``(vehicle, parameter, parameter)``, positive semidefinite.
         """
         sd_z = cov_z.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
         mean = (mean_z + 0.5 * sd_z.square()).exp()
@@ -160,8 +159,7 @@ class Belief(Displayed):
     def taken_from(self, state: dict[str, Any]) -> Belief:
         """The inverse of :meth:`state_dict`, for the same parameters, vehicles and draws; other entries are ignored.
 
-        Raises:
-            InputError: for other parameters, shapes or types.
+        Raises `InputError` for other parameters, shapes or types.
         """
         own = self.state_dict()
         shaped_as(own, {key: state[key] for key in own if key in state}, "state")

@@ -189,8 +189,7 @@ def whitened(form: ExponentialForm, coordinates: Coordinates) -> tuple[np.ndarra
 def chosen(density: Density, settings: SamplerSettings) -> Compiled | None:
     """The compiled loops for a walk by these settings; ``None`` for the eager walk.
 
-    Raises:
-        InputError: where the settings ask for compiled loops that cannot be had.
+    Raises `InputError` where the settings ask for compiled loops that cannot be had.
     """
     if settings.walk == "eager":
         return None

@@ -352,9 +352,8 @@ def missed_mass(
 ) -> Float[Tensor, " window"]:
     """Mass of the heaviest mode found far from the draws, over that at the draws, ``(window,)``; 0 where none was.
 
-    Args:
-        mean, lower: the draws' mean ``(window, parameter)`` and triangular root of their covariance.
-        eager: without compiled loops.
+    `mean`, `lower`: the draws' mean ``(window, parameter)`` and triangular root of their covariance. `eager`: without
+    compiled loops.
     """
     missed, loops = mean.new_zeros(len(mean)), Unavailable("not asked for") if eager else compiled(density)
     try:

@@ -26,10 +26,8 @@ Rows = Mapping[str, Tensor]
 class WindowLikelihood:
     """The likelihood of one window of every vehicle: with a prior it gives a posterior density.
 
-    Attributes:
-        n: usable rows, ``(vehicle,)``.
-        excited: ``(vehicle,)`` bool, by the fixed rule.
-        density: the posterior density of the vehicles named by an index, from their priors.
+    `n`: usable rows, ``(vehicle,)``. `excited`: ``(vehicle,)`` bool, by the fixed rule. `density`: the posterior
+    density of the vehicles named by an index, from their priors.
     """
 
     n: Real[Tensor, " vehicle"]
@@ -69,10 +67,9 @@ class ExcitationRule:
     vehicle: for one much quicker than the reference (a lag of 0.05 s, say) it excludes some windows that would resolve
     it.
 
-    Attributes:
-        T_ref, K_ref: reference lag [s] and gain [-], slow enough that a degraded vehicle is resolved, too.
-        sd_T, sd_K: the widest predicted SDs of ``T_L`` [s] and ``K_L`` [-]: the paper's accepted changes.
-        share: the least share of the window's rows that must be usable.
+    `T_ref`, `K_ref`: reference lag [s] and gain [-], slow enough that a degraded vehicle is resolved, too. `sd_T`,
+    `sd_K`: the widest predicted SDs of ``T_L`` [s] and ``K_L`` [-]: the paper's accepted changes. `share`: the least
+    share of the window's rows that must be usable.
     """
 
     T_ref: float = 1.0

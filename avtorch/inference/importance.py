@@ -43,8 +43,7 @@ class ImportanceSettings:
         width: SDs of a proposal over those it is fitted to. With narrower ones and lighter tails, intervals of 90 %
             held 1 % less of a long reference's mass; with these, half a per cent.
 
-    Raises:
-        InputError: naming the setting that is out of range.
+    Raises `InputError` naming the setting that is out of range.
     """
 
     draws: int = 256

@@ -35,9 +35,8 @@ def jerk_log_likelihood(
 ) -> Float[Tensor, "*batch"]:
     """Log likelihood of a window of measured jerk (Eq. 4 with Eq. 1), differentiable in every argument.
 
-    Args:
-        T_L, K_L, sigma: lag [s], gain [-], jerk noise [m/s^3]; shape ``(...)``.
-        a, u, jerk: realised and demanded acceleration [m/s^2], jerk [m/s^3]; shape ``(..., time)``.
+    `T_L`, `K_L`, `sigma`: lag [s], gain [-], jerk noise [m/s^3]; shape ``(...)``. `a`, `u`, `jerk`: realised and
+    demanded acceleration [m/s^2], jerk [m/s^3]; shape ``(..., time)``.
 
     Returns:
         Sum over time, shape ``(...)``.

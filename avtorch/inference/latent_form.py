@@ -43,11 +43,9 @@ LEAST_BITS = 1.0
 class LatentForm:
     """Windows of ``accel_cmd`` with measured ``accel`` and/or ``speed``, for :class:`LatentDensity`.
 
-    Args:
-        accel, speed: which of the two is measured.
-        noise: noise level at which excitation is predicted, by name (see :func:`latent_excitation`).
-        share: the least share of a window's rows that must be usable; the state at the start of a run is unknown, so
-            that a short end of a drive is less informative than its rows suggest.
+    `accel`, `speed`: which of the two is measured. `noise`: noise level at which excitation is predicted, by name (see
+    :func:`latent_excitation`). `share`: the least share of a window's rows that must be usable; the state at the start
+    of a run is unknown, so that a short end of a drive is less informative than its rows suggest.
     """
 
     sampler = SAMPLER

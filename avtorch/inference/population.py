@@ -42,9 +42,8 @@ class PopulationMargin:
         car: `(drive,)`, the number of the drive's car, from 0.
         spread: prior mean of the spreads.
 
-    Raises:
-        InputError: for other shapes, numbers that are not finite, an sd or spread of 0, fewer than two cars, or numbers
-            of cars with a gap.
+    Raises `InputError` for other shapes, numbers that are not finite, an sd or spread of 0, fewer than two cars, or
+    numbers of cars with a gap.
     """
 
     def __init__(

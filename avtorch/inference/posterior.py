@@ -85,8 +85,7 @@ class Posterior(Displayed):
         converged is in the group's ``attrs["converged"]``, as 0 or 1, beside the ``pareto_k`` of each. Needs ``pip
         install 'avtorch[arviz]'``.
 
-        Raises:
-            InputError: for a window that the posterior does not have, and where ArviZ is not installed.
+        Raises `InputError` for a window that the posterior does not have, and where ArviZ is not installed.
         """
         from avtorch.inference.arviz_export import inference_data
 

@@ -103,8 +103,7 @@ class Quadrature(Displayed):
     def quantile(self, q: float) -> Float[Tensor, "window parameter"]:
         """Posterior quantiles ``(window, parameter)``, by bisection of :meth:`cdf`.
 
-        Raises:
-            InputError: for ``q`` outside (0, 1).
+        Raises `InputError` for ``q`` outside (0, 1).
         """
         if not 0 < q < 1:
             raise InputError(f"q: {q} is not in (0, 1)")
@@ -135,8 +134,7 @@ def integrate(density: Density, *, mode: Mode | None = None, nodes: int = 49, to
         nodes: nodes an axis, odd; the cost is ``parameters * nodes**parameters`` evaluations a window.
         tolerance: largest :attr:`Quadrature.error` that passes; the full grid's own error is about its square.
 
-    Raises:
-        InputError: for a density of more than three parameters, or ``nodes`` even or below 9.
+    Raises `InputError` for a density of more than three parameters, or ``nodes`` even or below 9.
 
     Example:
         >>> from torch.distributions import Gamma, constraints

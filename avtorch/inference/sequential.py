@@ -55,8 +55,7 @@ class SequentialInference:
         kept: draws per vehicle that a belief carries.
         device: where beliefs are and posteriors are sampled; densities of `update` have to be there.
 
-    Raises:
-        InputError: for a mode, ``lam`` or ``forgetting`` out of range, or a device that this machine lacks.
+    Raises `InputError` for a mode, ``lam`` or ``forgetting`` out of range, or a device that this machine lacks.
 
     Example:
         >>> import torch
@@ -119,9 +118,8 @@ class SequentialInference:
     def update(self, density: Callable[[Tensor, Prior], Density], excited: Bool[Tensor, " vehicle"]) -> Belief:
         """Take in one window of every vehicle.
 
-        Args:
-            density: builds the posterior density of the vehicles named by an index from their priors.
-            excited: ``(vehicle,)`` bool; the others keep their belief.
+        `density`: builds the posterior density of the vehicles named by an index from their priors. `excited`:
+        ``(vehicle,)`` bool; the others keep their belief.
         """
         excited = excited.to(self.device)
         index = excited.nonzero().squeeze(-1)
@@ -163,9 +161,8 @@ class SequentialInference:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`.
 
-        Raises:
-            InputError: if it was saved by a loop of another mode or other parameters, or has other shapes or types than
-                this one saves; nothing is then changed.
+        Raises `InputError` if it was saved by a loop of another mode or other parameters, or has other shapes or types
+        than this one saves; nothing is then changed.
         """
         saved = about(state, "mode")
         own = about(self.state_dict(), "mode")

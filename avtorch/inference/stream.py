@@ -31,11 +31,9 @@ _LONGEST_S = 1e6  # up to this distance from the first row, times keep its resol
 class Window(Displayed):
     """One window of every vehicle, and the belief after it.
 
-    Attributes:
-        start_s, end_s: its bounds on the clock of the rows [s]; a row belongs to it if ``start_s <= time < end_s``.
-        n: usable rows, ``(vehicle,)``.
-        belief: see :class:`Belief`; the window was used where ``belief.excited`` and
-            ``belief.converged`` hold.
+    `start_s`, `end_s`: its bounds on the clock of the rows [s]; a row belongs to it if ``start_s <= time < end_s``.
+    `n`: usable rows, ``(vehicle,)``. `belief`: see :class:`Belief`; the window was used where ``belief.excited`` and
+    ``belief.converged`` hold.
     """
 
     start_s: float
@@ -68,9 +66,8 @@ class BeliefStream:
         **inference: the estimator's options, for ``"sgld"`` those of
             :class:`~avtorch.inference.sequential.SequentialInference` (``mode``, ``lam``, ``settings``, ``seed`` ...).
 
-    Raises:
-        InputError: for a ``window`` or ``gap`` that is not positive, an unknown estimator, an option it lacks, or a
-            device that this machine lacks.
+    Raises `InputError` for a ``window`` or ``gap`` that is not positive, an unknown estimator, an option it lacks, or a
+    device that this machine lacks.
 
     Example:
         >>> from avtorch import BeliefStream, GLVDPlant, Leader, simulate
@@ -134,11 +131,10 @@ class BeliefStream:
                 of the :data:`~avtorch.io.engagement.SETTLE_S` after it, in which the car's state is not known.
             until: the clock, if it is known to be ahead of the last row: a window that ends by then is closed.
 
-        Raises:
-            InputError: for time that does not increase, a column that is missing or of another shape, a usable row that
-                is not finite, or ``engaged`` other than 0 and 1. The block is then rejected as a whole. Also where the
-                last 10 to 40 s prove that a column has another unit or sign: the belief then also returns to its value
-                before them.
+        Raises `InputError` for time that does not increase, a column that is missing or of another shape, a usable row
+        that is not finite, or ``engaged`` other than 0 and 1. The block is then rejected as a whole. Also where the
+        last 10 to 40 s prove that a column has another unit or sign: the belief then also returns to its value before
+        them.
         """
         time = torch.atleast_1d(torch.as_tensor(time, dtype=torch.float64)).cpu()
         epoch = self._epoch
@@ -192,8 +188,7 @@ class BeliefStream:
     def flush(self) -> list[Window]:
         """Close the open window early, if it has any rows, and start afresh with the next row.
 
-        Raises:
-            InputError: as :meth:`feed` for units and signs.
+        Raises `InputError` as :meth:`feed` for units and signs.
         """
         with self._whole_or_nothing():
             return self._flush()
@@ -329,9 +324,8 @@ class BeliefStream:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`. Where it is refused, the stream is unchanged.
 
-        Raises:
-            InputError: if it was saved by a stream of another window length, form, estimator or number of vehicles, or
-                was changed since, by its checksum.
+        Raises `InputError` if it was saved by a stream of another window length, form, estimator or number of vehicles,
+        or was changed since, by its checksum.
         """
         state = without_checksum(state)
         own = {"estimator": self.estimator, "form": type(self.form).__name__, "window": self.window}
@@ -362,16 +356,14 @@ class BeliefStream:
     def save(self, path: str | PathLike[str]) -> None:
         """Write :meth:`state_dict` to a file, with a checksum, so that the file is complete or unchanged.
 
-        Raises:
-            InputError: where the place cannot be written, or is a symlink, a folder or a device.
+        Raises `InputError` where the place cannot be written, or is a symlink, a folder or a device.
         """
         write_state(path, self.state_dict())
 
     def load(self, path: str | PathLike[str]) -> None:
         """Read what :meth:`save` wrote; only tensors and plain values are read, no code is run.
 
-        Raises:
-            InputError: that names the file, for anything else; the stream is then unchanged.
+        Raises `InputError` that names the file, for anything else; the stream is then unchanged.
         """
         state = read_state(path)
         try:

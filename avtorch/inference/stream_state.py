@@ -29,8 +29,7 @@ def with_checksum(state: Mapping[str, Any]) -> dict[str, Any]:
 def without_checksum(state: Any) -> dict[str, Any]:
     """The state, once its fingerprint is found right.
 
-    Raises:
-        InputError: for a state that was changed since it was made, or that carries no fingerprint.
+    Raises `InputError` for a state that was changed since it was made, or that carries no fingerprint.
     """
     if not isinstance(state, dict) or not isinstance(state.get("sha256"), str):
         raise InputError("state: carries no checksum, as one damaged, or saved by an earlier avtorch; " + _REMEDY)
@@ -47,8 +46,7 @@ def without_checksum(state: Any) -> dict[str, Any]:
 def write_state(path: str | PathLike[str], state: Mapping[str, Any]) -> None:
     """Write a state so that the file is complete or unchanged.
 
-    Raises:
-        InputError: where the place cannot be written, or is a symlink, a folder or a device.
+    Raises `InputError` where the place cannot be written, or is a symlink, a folder or a device.
     """
     of = {key: state[key] for key in ("estimator", "form", "window", "vehicles")}
     write_sealed(Path(path), packed(state), schema=SCHEMA, of=of)
@@ -57,8 +55,7 @@ def write_state(path: str | PathLike[str], state: Mapping[str, Any]) -> None:
 def read_state(path: str | PathLike[str]) -> dict[str, Any]:
     """Read what :func:`write_state` wrote; only tensors and plain values are read, no code is run.
 
-    Raises:
-        InputError: for any file that is not exactly as written.
+    Raises `InputError` for any file that is not exactly as written.
     """
     content = read_sealed_bytes(Path(path), schema=SCHEMA, most=MOST, remedy=_REMEDY).content
     return unpacked(content, Path(path), _REMEDY)
@@ -74,8 +71,7 @@ def packed(state: Mapping[str, Any]) -> bytes:
 def unpacked(content: bytes, path: Path, remedy: str) -> dict[str, Any]:
     """The inverse of :func:`packed`, for the content of the file at ``path``.
 
-    Raises:
-        Damaged: for anything else; the message ends with ``remedy``.
+    Raises `Damaged` for anything else; the message ends with ``remedy``.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:

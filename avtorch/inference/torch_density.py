@@ -30,9 +30,8 @@ class TorchDensity:
             default.
         device: where ``log_density`` computes.
 
-    Raises:
-        InputError: for no parameters, a constraint that is not of a single number, a start that breaks one, or a
-            device that this machine lacks.
+    Raises `InputError` for no parameters, a constraint that is not of a single number, a start that breaks one, or a
+    device that this machine lacks.
     """
 
     windows = 1

@@ -31,9 +31,8 @@ def _time(row: TimedRow) -> float:
 class ReorderBuffer:
     """Rows that may still be overtaken; memory is bounded by `lateness` and `most`.
 
-    Args:
-        lateness: how far behind the newest row a row may come and still count [s].
-        most: rows kept back at most; beyond it the oldest are released early.
+    `lateness`: how far behind the newest row a row may come and still count [s]. `most`: rows kept back at most; beyond
+    it the oldest are released early.
     """
 
     def __init__(self, lateness: float, most: int) -> None:

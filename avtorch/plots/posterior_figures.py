@@ -8,16 +8,19 @@ from typing import Literal
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.stats import uniform
 
-from avtorch.plots.chosen_windows import ChosenWindows, converged, relative_width
+from avtorch.plots.chosen_windows import ChosenWindows, converged, evenly, relative_width
 from avtorch.plots.posteriors import agreement_reach, agreement_scatter, joint_cloud, marginals
-from avtorch.plots.ranks import METHODS, ecdf_difference, rank_plot
-from avtorch.plots.style import BLACK, short, styled
-from avtorch.plots.validation_ranks import POINTS, ecdfs_of, groups_of, ranks_of
+from avtorch.plots.style import BLACK, BLUE, VERMILLION, short, styled
 from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE
+from avtorch.validation.diagnostics import arviz
 from avtorch.validation.validate import Validation
 
 _NARROW = 4.0  # inches
+_COLOURS = {"SGLD": BLUE, "NUTS": VERMILLION, "exact": "#555555"}
+BINS = 10
+"""Of ranks."""
 
 METHOD = {"nuts": "NUTS", "quadrature": "quadrature"}
 Place = Literal["outside upper center", "outside lower center"]
@@ -49,7 +52,7 @@ def validation_figures(validation: Validation, *, narrow: bool = False) -> dict[
         "agreement.png": lambda: agreement_figure(validation, narrow=narrow),
     }
     if validation.quadrature is not None:
-        figures["ecdf.png"] = lambda: ecdf_figure(validation, narrow=narrow)
+        figures["ecdf.png"] = lambda: ecdf_figure(chosen, narrow=narrow)
     return figures
 
 
@@ -92,61 +95,52 @@ def joint_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
 
 @styled
 def ranks_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
-    """Ranks of groups of SGLD's chains, of NUTS and of exact draws in their common pool; a row a window."""
-    found, names = chosen.validation, chosen.validation.names
-    rows = groups_of(found) + 2
-    figure, axes = _panels(
-        len(chosen.windows), len(names), (_wide(names), 0.33 * rows + 0.6), beside=1.4, narrow=narrow
-    )
+    """Ranks of groups of SGLD's chains, of NUTS and of exact draws in their common pool, by ArviZ; a row a window."""
+    names = chosen.validation.names
+    rows = len(chosen.groups(0, 0))
+    size = (_wide(names), 0.33 * rows + 0.6)
+    figure, axes = _panels(len(chosen.windows), len(names), size, beside=0.9, narrow=narrow)
     for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
-        for name, counted, ax in zip(names, ranks_of(chosen, row), line, strict=True):
-            rank_plot(ax, counted.counts, effective=counted.effective)
-            if row == len(axes) - 1 or narrow:
-                ax.set_xlabel(f"rank of {short(name)} [-]")
-        for ax in () if narrow else line[1:]:
-            ax.set_yticklabels([])
+        for i, (name, ax) in enumerate(zip(names, line, strict=True)):
+            groups = chosen.groups(row, i)
+            least = min(map(len, groups.values()))
+            pool = np.stack([evenly(x, least) for x in groups.values()])
+            arviz().plot_rank({name: pool}, bins=BINS, ax=ax, colors=[_COLOURS[group.split()[0]] for group in groups])
+            ax.set(title="", ylabel="", xlabel=f"rank of {short(name)}" if row == len(axes) - 1 or narrow else "")
+            ax.xaxis.label.set_size("medium")
+            ax.set_yticklabels(list(groups) if narrow or not i else [])
         line[0].set_title(window.title)
-    _title(
-        figure,
-        "Ranks of each group in the pool of all draws, as shares: bars are relative to the count expected, grey is "
-        "the band that holds all bars of a panel with 95 % probability, ± its half width (by effective sample sizes)",
-        narrow,
-    )
+    _title(figure, "Ranks of each group in the pool of all draws, as many as are effective: even bars agree", narrow)
     return figure
 
 
 @styled
-def ecdf_figure(validation: Validation, *, narrow: bool = False) -> Figure:
-    """Exact probabilities below the draws: their ECDF less the uniform one, a line a window, for SGLD and for NUTS."""
-    names, arms = validation.names, ecdfs_of(validation)
-    figure, axes = _panels(len(arms), len(names), (_wide(names), 2.7), beside=0.5, sharey="row", narrow=narrow)
-    for line, arm in zip(axes, arms, strict=True):
-        reach = 0.0
+def ecdf_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
+    """Exact probabilities below the draws: their ECDF less the uniform one and its 95 % band, by ArviZ; a row a window.
+
+    Draws count by their effective sample size.
+    """
+    names = chosen.validation.names
+    figure, axes = _panels(len(chosen.windows), len(names), (_wide(names), 2.4), beside=0.5, narrow=narrow)
+    for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
         for i, (name, ax) in enumerate(zip(names, line, strict=True)):
-            inside, taken = arm.inside[i], len(arm.windows)
-            drawn = arm.less_uniform[i]
-            if taken:
-                ecdf_difference(ax, {}, arm.band[i], label="95 % band at the median effective sample size")
-            at = np.linspace(0, 1, POINTS + 1)
-            for mask, look in (
-                (inside, {"linewidth": 0.7, "alpha": float(np.clip(12 / max(1, taken), 0.15, 0.8))}),
-                (~inside, {"linewidth": 1.0, "linestyle": "--"}),
-            ):
-                ax.plot(at, drawn[mask].T, color=METHODS[arm.method], zorder=2, **look)
-            reach = max([reach, ax.get_ylim()[1], 1.05 * float(np.abs(drawn).max(initial=0))])
-            ax.set_title(f"{arm.method}, {short(name)}: {inside.sum()} of {taken} inside")
-        line[0].set_ylim(-reach, reach)
-        line[0].set_ylabel("ECDF less uniform [-]")
-    for ax in axes[-1]:
-        ax.set_xlabel("exact probability below a draw [-]")
-    for ax in axes.flat if not narrow else ():
-        ax.label_outer()
-    _title(
-        figure,
-        "One line per converged window, dashed where it leaves its own 95 % band (1 in 20 at most by chance);"
-        " grey: the band at the median effective sample size",
-        narrow,
-    )
+            for method, values in chosen.exact_probabilities(row, i).items():
+                look = {"color": _COLOURS[method]}
+                arviz().plot_ecdf(
+                    values,
+                    cdf=uniform.cdf,
+                    eval_points=np.linspace(0.01, 0.99, 99),
+                    difference=True,
+                    confidence_bands="simulated",
+                    random_state=0,
+                    ci_prob=0.95,
+                    plot_kwargs={**look, "label": method},
+                    fill_kwargs={**look, "alpha": 0.15},
+                    ax=ax,
+                )
+            ax.set(xlabel=f"exact probability below a draw of {short(name)}", ylabel="" if i else "ECDF less uniform")
+        line[0].set_title(window.title)
+    _legend(figure, axes, narrow=narrow)
     return figure
 
 

@@ -90,8 +90,7 @@ class Agreement:
 def agreement(posterior: Posterior, quadrature: Quadrature) -> Agreement:
     """Draws against quadrature over the same windows.
 
-    Raises:
-        InputError: if parameters or windows differ, or ArviZ is missing.
+    Raises `InputError` if parameters or windows differ, or ArviZ is missing.
 
     Example:
         >>> import torch
@@ -122,8 +121,7 @@ def agreement(posterior: Posterior, quadrature: Quadrature) -> Agreement:
 def between(posterior: Posterior, other: Posterior) -> Agreement:
     """Draws against other draws of the same windows, ``other`` being the reference; both have Monte Carlo errors.
 
-    Raises:
-        InputError: if parameters or windows differ, or ArviZ is missing.
+    Raises `InputError` if parameters or windows differ, or ArviZ is missing.
 
     Example:
         >>> import torch

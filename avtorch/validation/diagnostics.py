@@ -72,8 +72,8 @@ def superchains(draws: Tensor, count: int = SUPERCHAINS) -> Tensor:
 def sampling_diagnostics(posterior: Posterior) -> Diagnostics:
     """Moments, R-hat and effective sample sizes of every window.
 
-    Raises:
-        InputError: if ArviZ is missing, or for fewer than four draws per (super)chain, the least that it can evaluate.
+    Raises `InputError` if ArviZ is missing, or for fewer than four draws per (super)chain, the least that it can
+    evaluate.
     """
     az = arviz()
     import xarray

@@ -24,15 +24,12 @@ def sine_commands(
 ) -> Tensor:
     """Two sines (2 and 5 rad/s, the second half as large) of random phases: demanded acceleration [m/s^2].
 
-    Args:
-        amplitude: see :data:`Amplitude`.
-        dt: sampling step [s].
+    `amplitude`: see :data:`Amplitude`. `dt`: sampling step [s].
 
     Returns:
         Shape ``(window, time)``.
 
-    Raises:
-        InputError: for an amplitude that is not positive, or a range that runs down.
+    Raises `InputError` for an amplitude that is not positive, or a range that runs down.
     """
     low, high = amplitude if isinstance(amplitude, tuple) else (amplitude, amplitude)
     if not 0 < low <= high:
@@ -50,15 +47,13 @@ def simulate_windows(
 
     A lag below ``dt`` would diverge where a sample's jerk is held for ``dt``; it is held for ``T_L`` then.
 
-    Args:
-        z: shape ``(window, 3)``.
-        u: demanded acceleration [m/s^2], ``(window, time)``; the acceleration starts at the first command.
+    `z`: shape ``(window, 3)``. `u`: demanded acceleration [m/s^2], ``(window, time)``; the acceleration starts at the
+    first command.
 
     Returns:
         ``a`` and ``jerk``, each ``(window, time)``.
 
-    Raises:
-        InputError: for shapes that do not match.
+    Raises `InputError` for shapes that do not match.
     """
     if z.ndim != 2 or z.shape[1] != 3 or u.ndim != 2 or len(u) != len(z):
         raise InputError(f"z, u: found shapes {tuple(z.shape)}, {tuple(u.shape)}, need (window, 3), (window, time)")

@@ -199,8 +199,7 @@ def validate(
         nuts: its chains and draws; by default those of `NutsSettings`, and fewer in the latent form.
         progress: called with (done, of); or True for a bar, False for none, None for a bar in a notebook only.
 
-    Raises:
-        InputError: if ArviZ or Pyro is missing, for ``nuts_windows`` below 1, or for a log that cannot be used.
+    Raises `InputError` if ArviZ or Pyro is missing, for ``nuts_windows`` below 1, or for a log that cannot be used.
 
     Example:
         >>> from avtorch.inference import SamplerSettings

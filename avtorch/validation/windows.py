@@ -77,8 +77,7 @@ class Windows:
     def select(self, index: Tensor) -> Windows:
         """The windows named by ``index``.
 
-        Raises:
-            InputError: if the density's windows cannot be taken apart.
+        Raises `InputError` if the density's windows cannot be taken apart.
         """
         if not isinstance(self.density, SelectableDensity):
             raise InputError(f"density: the windows of {type(self.density).__name__} cannot be selected")
@@ -99,8 +98,7 @@ def synthetic_windows(count: int, *, seed: int = 0) -> Windows:
     Lag, gain, noise and the largest command are drawn from `LAG`, `GAIN`, `NOISE` and `AMPLITUDE`; every other window
     has 200 and 500 points at 100 Hz; the command is a sum of three sines or a piece of the US06 cycle, as often.
 
-    Raises:
-        InputError: for ``count`` below 1.
+    Raises `InputError` for ``count`` below 1.
 
     Example:
         >>> from avtorch.inference import find_mode
@@ -121,8 +119,7 @@ def windows_from_prior(count: int, *, seed: int = 0, prior: Prior | None = None)
     """The same drives with vehicles drawn from the prior: the truths for which intervals must have their stated
     coverage.
 
-    Raises:
-        InputError: for ``count`` below 1.
+    Raises `InputError` for ``count`` below 1.
     """
     generator = _generator(count, seed)
     prior = Joint(default_actuation_prior(), default_jerk_noise_prior()) if prior is None else prior
@@ -135,13 +132,10 @@ def windows_of_log(log: Log, *, window: float = 2.0, count: int | None = None) -
     They lie on the grid of the sequential loop, which starts afresh with each segment; windows with fewer than
     `LEAST_ROWS` usable rows are left out.
 
-    Args:
-        window: length [s].
-        count: at most so many, evenly spread over the log; all by default.
+    `window`: length [s]. `count`: at most so many, evenly spread over the log; all by default.
 
-    Raises:
-        InputError: for a log without accel_cmd or without a usable window, a ``window`` that is not positive, or
-            ``count`` below 1.
+    Raises `InputError` for a log without accel_cmd or without a usable window, a ``window`` that is not positive, or
+    ``count`` below 1.
     """
     if log.accel_cmd is None:
         raise no_command(log, "; T_L and K_L need the demanded acceleration")

@@ -40,8 +40,7 @@ def make_estimator(name: str, form: Form, *, vehicles: int = 1, **options: Any) 
     ``options`` are its own: those of :class:`SequentialInference` for ``sgld`` and ``map``, ``forgetting`` for ``rls``,
     ``drift`` and ``noise`` for ``ekf`` and ``ukf``, and ``actuation_prior``, ``kept`` and ``seed`` for all.
 
-    Raises:
-        InputError: for an unknown name, an option that the estimator does not have, or one out of range.
+    Raises `InputError` for an unknown name, an option that the estimator does not have, or one out of range.
     """
     made = ESTIMATORS.get(name)
     if made is None:

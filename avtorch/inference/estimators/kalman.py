@@ -101,9 +101,7 @@ class StateModel(Protocol):
 class JerkState:
     """``(log T_L, log K_L)`` as a random walk, observed through Eq. 1: ``jerk = (K_L u - a)/T_L + N(0, sigma^2)``.
 
-    Args:
-        sigma: jerk noise [m/s³], ``(vehicle,)``.
-        drift: SD of the walk per square root of a second, of both logarithms.
+    `sigma`: jerk noise [m/s³], ``(vehicle,)``. `drift`: SD of the walk per square root of a second, of both logarithms.
     """
 
     def __init__(self, sigma: Float[Tensor, " vehicle"], drift: float) -> None:
@@ -218,12 +216,10 @@ class JointKalman(WindowedEstimator):
     latent form it is ``noise``, which the belief repeats without spread. A window in which the filter diverges does not
     count as converged: the belief is carried over and the filter begins anew.
 
-    Args:
-        drift: SD of the walk of both logarithms per square root of a second.
-        noise: levels by name for the latent form, in the units of ``NOISE_PRIOR``, whose medians are the default.
+    `drift`: SD of the walk of both logarithms per square root of a second. `noise`: levels by name for the latent form,
+    in the units of ``NOISE_PRIOR``, whose medians are the default.
 
-    Raises:
-        InputError: for a form without a state model, a ``drift`` below 0, or noise that the form does not have.
+    Raises `InputError` for a form without a state model, a ``drift`` below 0, or noise that the form does not have.
     """
 
     def __init__(
@@ -261,9 +257,7 @@ class JointKalman(WindowedEstimator):
     ) -> tuple[GaussianState, Float[Tensor, " vehicle"]]:
         """Filter all usable rows of a window; after a gap or an unused row all but the parameters restarts.
 
-        Args:
-            actuation: belief in ``(log T_L, log K_L)`` at the first row.
-            columns: the measured signals, one a channel.
+        `actuation`: belief in ``(log T_L, log K_L)`` at the first row. `columns`: the measured signals, one a channel.
 
         Returns:
             The belief in them after the last row, and the log likelihood ``(vehicle,)``.

@@ -36,12 +36,10 @@ class RecursiveLeastSquares(WindowedEstimator):
     There is no prior, so a belief needs both coefficients well above zero (``CLEAR``); until then a window counts as
     not converged: its sums are kept, the belief is carried over.
 
-    Args:
-        forgetting: in (0, 1], per row; 1 forgets nothing. The memory is ``1 / (1 - forgetting)`` rows: the default
-            remembers 200, a window of 2 s at 100 Hz.
+    `forgetting`: in (0, 1], per row; 1 forgets nothing. The memory is ``1 / (1 - forgetting)`` rows: the default
+    remembers 200, a window of 2 s at 100 Hz.
 
-    Raises:
-        InputError: where jerk is not measured, or for ``forgetting`` out of range.
+    Raises `InputError` where jerk is not measured, or for ``forgetting`` out of range.
     """
 
     def __init__(self, form: Form, *, forgetting: float = 0.995, **options: Any) -> None:
