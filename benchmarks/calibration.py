@@ -23,7 +23,7 @@ from avtorch.inference.priors import Prior
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.inference.sequential import Mode, SequentialInference
-from avtorch.validation.simulation import Amplitude, statistics
+from avtorch.validation.windows import Amplitude, statistics
 from benchmarks.rank_calibration import (
     LEVELS,
     RankCalibration,

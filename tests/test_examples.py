@@ -24,7 +24,7 @@ SLOW = frozenset(
         "avtorch.external.external_simulator.ExternalSimulator",
         "avtorch.external.fmu.FmuSimulator",
         "avtorch.external.identification.SimulatorCheck",
-        "avtorch.external.simulator_comparison.SimulatorComparison",
+        "avtorch.external.compare_simulators.SimulatorComparison",
         "avtorch.external.wrap.wrap",
         "avtorch.fleet.folder.read_rows",
         "avtorch.fleet.run.run_fleet",

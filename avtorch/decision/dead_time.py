@@ -16,9 +16,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import BoolArray, FloatArray
-from avtorch.inference.latent import LatentDensity
-from avtorch.inference.latent_form import latent_excitation
-from avtorch.inference.latent_window import LatentWindow
+from avtorch.inference.latent import LatentDensity, LatentWindow, latent_excitation
 from avtorch.inference.map import Mode, find_mode
 from avtorch.io.log import Log
 

@@ -18,7 +18,7 @@ from avtorch.decision.watch import Watch, WatchedWindow
 from avtorch.display.progress import asks_for_bar, called, progress_bar
 from avtorch.errors import InputError
 from avtorch.inference.form import JerkForm
-from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.latent import LatentForm
 from avtorch.inference.stream import BeliefStream
 from avtorch.io.log import STANDSTILL_MPS
 from avtorch.vehicle.block import Block

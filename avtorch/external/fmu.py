@@ -28,8 +28,7 @@ from avtorch.external import fmu_process
 from avtorch.external.fmu_process import NOT_RUNNING
 from avtorch.external.fmu_variables import SIGNALS, STARTS, Variable, ports
 from avtorch.io.mapping import mapping_beside
-from avtorch.io.opening import place
-from avtorch.io.toml import read_toml
+from avtorch.io.opening import place, read_toml
 
 OPENING_S = 120.0
 """For unpacking, for loading and for the begin of a drive: starting the tool behind an FMU can take a minute."""

@@ -17,6 +17,7 @@ from avtorch.inference.density import (
     ScoredDensity,
     SelectableDensity,
     SubsampledDensity,
+    TorchDensity,
 )
 from avtorch.inference.form import ExcitationRule, Form, JerkForm, WindowLikelihood
 from avtorch.inference.jerk import JerkDensity, JerkPoints, JerkStatistics, jerk_log_likelihood
@@ -29,7 +30,6 @@ from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.inference.sequential import SequentialInference
 from avtorch.inference.sgld import SGLD
 from avtorch.inference.stream import BeliefStream, Window
-from avtorch.inference.torch_density import TorchDensity
 
 __all__ = [
     "SGLD",

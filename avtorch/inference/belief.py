@@ -11,11 +11,11 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float, Int
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
+from avtorch.inference.arviz_export import UNITS, shown_unit
 from avtorch.inference.device import Device
 from avtorch.inference.posterior import quantile_of
 from avtorch.inference.priors import Prior
 from avtorch.inference.state import shaped_as
-from avtorch.inference.units import UNITS, shown_unit
 
 if TYPE_CHECKING:
     import pandas

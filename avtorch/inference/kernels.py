@@ -339,7 +339,7 @@ def _mean_log(x, b):
 @njit("void(float64[:,::1], float64[::1])", cache=True, **_OPTIONS)
 def pareto_shapes(largest, out):
     """Of each window's largest log ratios ``(window, tail + 1)``, falling and none of them NaN, what
-    :func:`avtorch.inference.pareto.pareto_k` has of all."""
+    :func:`avtorch.inference.importance.pareto_k` has of all."""
     tail = largest.shape[1] - 1
     count = 30 + int(math.sqrt(tail))
     x, steps, profile = np.empty(tail), np.empty(count), np.empty(count)

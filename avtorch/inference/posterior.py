@@ -11,8 +11,8 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
+from avtorch.inference.arviz_export import UNITS, shown_unit
 from avtorch.inference.exactness import Exactness
-from avtorch.inference.units import UNITS, shown_unit
 
 if TYPE_CHECKING:
     import pandas

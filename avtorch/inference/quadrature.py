@@ -15,9 +15,9 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
+from avtorch.inference.arviz_export import shown_unit
 from avtorch.inference.density import Density
 from avtorch.inference.map import Mode, find_mode
-from avtorch.inference.units import shown_unit
 
 #: Initial half width of the grid in SDs, the growth of a side that still has mass, and how often it may grow.
 REACH, GROWTH, ROUNDS = 7.0, 1.3, 12

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from avtorch.errors import InputError, printable, quoted
-from avtorch.io.arrow_cells import cells_of, is_text, scalar_checks
+from avtorch.io.formats.parquet import cells_of, is_text, scalar_checks
 from avtorch.io.tables import Table, with_whole_stamps
 
 _INDEX = "__index_level_0__"  # pandas' own name for an index without one

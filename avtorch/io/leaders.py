@@ -20,7 +20,7 @@ from avtorch.io.consistency import scale_between
 from avtorch.io.mapping import Pairs, pairs
 from avtorch.io.opening import place
 from avtorch.io.tables import Table, read_bytes, read_table
-from avtorch.io.text.encoding import decoded
+from avtorch.io.text import decoded
 from avtorch.io.units import to_si
 from avtorch.io.validity import check_range, check_time
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from avtorch.errors import InputError
-from avtorch.inference.stream_state import packed, unpacked
+from avtorch.inference.stream import packed, unpacked
 from avtorch.io import read_sealed, read_sealed_bytes, write_sealed
 from avtorch.live.car import LiveCar
 from avtorch.live.live_watch import LiveWatch

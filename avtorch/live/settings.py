@@ -12,7 +12,7 @@ from avtorch.decision.settings import Setting
 from avtorch.decision.watch import Watch
 from avtorch.errors import InputError
 from avtorch.inference.form import Form, JerkForm
-from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.latent import LatentForm
 from avtorch.inference.stream import BeliefStream
 from avtorch.vehicle.controllers import NOMINAL_GAINS
 

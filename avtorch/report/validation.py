@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import ks_2samp, kstest
 
-from avtorch.inference.units import shown_unit
-from avtorch.plots.chosen_windows import ChosenWindows
-from avtorch.plots.posterior_figures import validation_figures
+from avtorch.inference.arviz_export import shown_unit
+from avtorch.plots.posterior_figures import ChosenWindows, validation_figures
 from avtorch.report.origin import Origin
 from avtorch.report.page import Page, Picture, Section, picture_of, written
 from avtorch.report.table import Table

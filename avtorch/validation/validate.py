@@ -15,13 +15,13 @@ from torch import Tensor
 from avtorch.display import Card, Displayed, Frame
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
+from avtorch.inference.arviz_export import shown_unit
 from avtorch.inference.map import find_mode
 from avtorch.inference.posterior import Posterior
 from avtorch.inference.quadrature import Quadrature
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings
-from avtorch.inference.units import shown_unit
-from avtorch.io.source import LogSource, as_log
+from avtorch.io.log import LogSource, as_log
 from avtorch.validation.agreement import Agreement, AgreementVerdict, agreement, agreement_verdict, between
 from avtorch.validation.reference import (
     LATENT_NUTS,

@@ -16,8 +16,7 @@ from avtorch.inference import (
     PopulationMargin,
     TorchDensity,
 )
-from avtorch.inference.latent import LatentDensity
-from avtorch.inference.latent_window import LatentWindow
+from avtorch.inference.latent import LatentDensity, LatentWindow
 from avtorch.inference.priors import (
     Joint,
     LogSpaceNormal,

@@ -26,7 +26,7 @@ from avtorch.inference import (
     sample,
 )
 from avtorch.inference.exactness import Moments, weighed
-from avtorch.inference.pareto import pareto_k
+from avtorch.inference.importance import pareto_k
 from avtorch.inference.posterior import effective_sample_size, normal_scores
 from avtorch.inference.sgld import harmonic
 from avtorch.validation.windows import synthetic_windows

@@ -29,10 +29,8 @@ from avtorch.inference.belief import Summary
 from avtorch.inference.estimators.windowed import WindowedEstimator
 from avtorch.inference.form import Form, JerkForm, Rows
 from avtorch.inference.jerk import JerkStatistics
-from avtorch.inference.latent import NOISE_PRIOR
-from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.latent import GAP, NOISE_PRIOR, LatentForm
 from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, Step, discretise, initial_covariance
-from avtorch.inference.latent_window import GAP
 
 PLAUSIBLE = ((0.01, 20.0), (0.02, 20.0))
 """Bounds of ``T_L`` [s] and ``K_L``; a filter that leaves them has diverged, and restarts from the prior."""
