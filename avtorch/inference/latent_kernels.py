@@ -1,7 +1,6 @@
 """The latent log likelihood as a compiled loop over rows (numba), even and uneven alike.
 
-The law is that of :mod:`~avtorch.inference.latent_model`, the recursion that of
-:mod:`~avtorch.inference.latent_filter`, written out for the state ``(v, a, c, e)`` whose two halves move apart: of the
+The law and the recursion are those of :mod:`~avtorch.inference.latent_model`, written out for the state ``(v, a, c, e)`` whose two halves move apart: of the
 covariance's ten numbers and the mean's four none is computed that is zero.
 
 Everything compiled of this form stands in this file: numba's cache on disk is renewed when the file changes, and only

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Literal
 
@@ -16,7 +16,7 @@ from scipy.stats import uniform
 from torch import Tensor
 
 from avtorch.arrays import FloatArray
-from avtorch.inference import Posterior
+from avtorch.inference import Posterior, Quadrature
 from avtorch.plots.posteriors import agreement_reach, agreement_scatter, joint_cloud, marginals
 from avtorch.plots.style import BLACK, BLUE, VERMILLION, short, styled
 from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE, arviz, sampling_diagnostics
@@ -81,15 +81,15 @@ class ChosenWindows:
     def exact_probabilities(self, row: int, i: int) -> dict[str, FloatArray]:
         """Of draws of the `i`-th parameter that are effective, the exact probability of what is below, by method."""
         found, window = self.validation, self.windows[row]
-        assert found.quadrature is not None
+        exact = found.quadrature
+        assert exact is not None
         drawn = {"SGLD": found.sgld.flat[:, window.number]}
         if window.nuts is not None:
             drawn["NUTS"] = found.nuts.flat[:, window.nuts]
         out = {}
         for method, draws in drawn.items():
             some = torch.from_numpy(evenly(draws.numpy(), _count(self._effective(row, i, method), draws)))
-            one = replace(found.quadrature, nodes=found.quadrature.nodes[[window.number]],
-                          mass=found.quadrature.mass[[window.number]])  # fmt: skip
+            one = Quadrature(exact.names, *(getattr(exact, f.name)[[window.number]] for f in fields(exact)[1:]))
             out[method] = one.cdf(some[:, None])[:, 0, i].clamp(0, 1).numpy()
         return out
 

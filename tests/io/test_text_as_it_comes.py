@@ -186,7 +186,7 @@ def test_the_layout_is_found_in_what_is_there():
 
 
 def test_a_bomb_stops_at_the_limit(monkeypatch):
-    from avtorch.io.text import encoding
+    from avtorch.io import text as encoding
 
     monkeypatch.setattr(encoding, "MOST_BYTES", 10_000)
     with pytest.raises(InputError, match="holds over 10,000 bytes"):
