@@ -29,8 +29,8 @@ from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
-    from avtorch.decision.record import SupervisedRun
     from avtorch.decision.strategist import Strategist
+    from avtorch.decision.watch import SupervisedRun
     from avtorch.report import Origin
     from avtorch.vehicle import Block, ClosedLoop, Leader
 

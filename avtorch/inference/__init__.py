@@ -17,7 +17,6 @@ from avtorch.inference.density import (
     ScoredDensity,
     SelectableDensity,
     SubsampledDensity,
-    TorchDensity,
 )
 from avtorch.inference.form import ExcitationRule, Form, JerkForm, WindowLikelihood
 from avtorch.inference.jerk import JerkDensity, JerkPoints, JerkStatistics, jerk_log_likelihood
@@ -52,7 +51,6 @@ __all__ = [
     "SelectableDensity",
     "SequentialInference",
     "SubsampledDensity",
-    "TorchDensity",
     "Window",
     "WindowLikelihood",
     "find_mode",

@@ -19,9 +19,8 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.inference.form import Rows
 from avtorch.inference.jerk import JerkStatistics
-from avtorch.io.consistency import LATER_S, MIN_SPANS, SPANS_S, may_be_late
 from avtorch.io.units import GRAVITY
-from avtorch.io.validity import ACCEL_FACTORS, SAME_MOTION, SPEED_FACTORS
+from avtorch.io.validity import ACCEL_FACTORS, LATER_S, MIN_SPANS, SAME_MOTION, SPANS_S, SPEED_FACTORS, may_be_late
 
 RATES = (("speed", "accel"), ("accel", "jerk"))
 """Pairs of a level and its rate, among the columns of the forms."""

@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError, listed, printable
-from avtorch.io.consistency import scale_between
 from avtorch.io.mapping import Pairs, pairs
 from avtorch.io.opening import place
 from avtorch.io.tables import Table, read_bytes, read_table
 from avtorch.io.text import decoded
 from avtorch.io.units import to_si
-from avtorch.io.validity import check_range, check_time
+from avtorch.io.validity import check_range, check_time, scale_between
 
 LONG_STEP_S = 1.5
 """A recording with a longer step between rows is cut there: the drive cycles come at 1 Hz, everything else at 10 Hz."""

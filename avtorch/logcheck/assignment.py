@@ -17,12 +17,11 @@ from itertools import product
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.io.consistency import MIN_SPANS, SPANS_S
 from avtorch.io.formats.listed import Recording
 from avtorch.io.formats.presets import PRESETS, Preset, Source
 from avtorch.io.merge import held, merged
 from avtorch.io.tables import Table, whole_stamps
-from avtorch.io.validity import MOST_BAD, codes
+from avtorch.io.validity import MIN_SPANS, MOST_BAD, SPANS_S, codes
 from avtorch.logcheck.recorder import lateness
 from avtorch.logcheck.vocabulary import Header, bare_unit, header_of, likeness, means_otherwise, signals_named
 

@@ -14,7 +14,6 @@ from avtorch.inference import (
     JerkPoints,
     JerkStatistics,
     PopulationMargin,
-    TorchDensity,
 )
 from avtorch.inference.latent import LatentDensity, LatentWindow
 from avtorch.inference.priors import (
@@ -26,6 +25,7 @@ from avtorch.inference.priors import (
     default_jerk_noise_prior,
 )
 from avtorch.vehicle.glvd import glvd_jerk, glvd_rollout
+from benchmarks.torch_density import TorchDensity
 
 F64 = torch.float64
 
