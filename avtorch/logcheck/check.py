@@ -10,8 +10,8 @@ from typing import Any
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.io.dataframe import DataFrame, frame_table, is_dataframe
-from avtorch.io.following import read_following
 from avtorch.io.formats import is_recording, open_recording
+from avtorch.io.leaders import read_following
 from avtorch.io.log import Log, LogSource, as_log
 from avtorch.io.mapping import Pairs, mapping_beside
 from avtorch.io.opening import place

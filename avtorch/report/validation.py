@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +11,7 @@ from scipy.stats import ks_2samp, kstest
 from avtorch.inference.arviz_export import shown_unit
 from avtorch.plots.posterior_figures import ChosenWindows, validation_figures
 from avtorch.report.origin import Origin
-from avtorch.report.page import Page, Picture, Section, picture_of, written
+from avtorch.report.page import Page, Picture, Section, picture_of
 from avtorch.report.table import Table
 from avtorch.results import validation_answer
 from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE
@@ -59,11 +57,6 @@ def validation_html(found: Validation, *, origin: Origin | None = None) -> str:
         "green" if found.verdict.agree else "amber",
     )
     return page.html(origin)
-
-
-def write_validation_page(found: Validation, folder: str | PathLike[str], *, origin: Origin | None = None) -> Path:
-    """Write `validation.html` into `folder`; returns its path. Raises `InputError` where it cannot be written."""
-    return written(validation_html(found, origin=origin), folder, "validation.html")
 
 
 def _pictures(found: Validation) -> dict[str, Picture]:
