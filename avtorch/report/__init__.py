@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from avtorch.report.diagnosis import report_html, write_report
     from avtorch.report.estimates import estimates_html
     from avtorch.report.fleet import fleet_html, write_fleet_page
-    from avtorch.report.origin import Origin
+    from avtorch.report.page import Origin
     from avtorch.report.run import run_html
     from avtorch.report.validation import validation_html
 
@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 _HOME = {
-    "Origin": "origin",
+    "Origin": "page",
     "credibility_page": "credibility",
     "report_html": "diagnosis",
     "write_credibility": "credibility",

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from avtorch.gap.quantity import Quantity, unit_of, words_of
-from avtorch.report.origin import Origin
-from avtorch.report.page import Page, Picture, Section, Tone, picture_of
+from avtorch.report.page import Origin, Page, Picture, Section, Tone, picture_of
 from avtorch.report.table import Table
 
 if TYPE_CHECKING:

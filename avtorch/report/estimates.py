@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 from avtorch.errors import InputError
 from avtorch.io.clock import from_start
 from avtorch.plots.time import belief_figure, probability_figure
-from avtorch.report.origin import Origin
-from avtorch.report.page import Page, Picture, Section, Tone, picture_of
+from avtorch.report.page import Origin, Page, Picture, Section, Tone, picture_of
 from avtorch.report.window_tables import alert_table, probability_table, window_table
 from avtorch.results import estimates_answer
 

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 from avtorch.arrays import FloatArray
 from avtorch.plots.plane import loop_of, region_figure
 from avtorch.plots.time import Motion, Steps, motion_figure, overview_figure
-from avtorch.report.origin import Origin
-from avtorch.report.page import Page, Picture, Section, picture_of
+from avtorch.report.page import Origin, Page, Picture, Section, picture_of
 from avtorch.report.table import Table, of_numbers
 from avtorch.report.window_tables import window_table
 from avtorch.results import MEASURES

@@ -10,8 +10,7 @@ from scipy.stats import ks_2samp, kstest
 
 from avtorch.inference.arviz_export import shown_unit
 from avtorch.plots.posterior_figures import ChosenWindows, validation_figures
-from avtorch.report.origin import Origin
-from avtorch.report.page import Page, Picture, Section, picture_of
+from avtorch.report.page import Origin, Page, Picture, Section, picture_of
 from avtorch.report.table import Table
 from avtorch.results import validation_answer
 from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE
