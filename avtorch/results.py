@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from avtorch.decision.estimation import Estimates
-    from avtorch.decision.record import SupervisedRun
-    from avtorch.decision.watch import WatchedWindow
+    from avtorch.decision.watch import SupervisedRun, WatchedWindow
     from avtorch.inference import Posterior, Quadrature
     from avtorch.validation import Validation
     from avtorch.vehicle import Block
@@ -83,7 +82,7 @@ def estimates_answer(estimates: Estimates) -> dict[str, Any]:
     Times are on the log's own clock; `epoch_s` is its first row's.
     """
     # imported here: no other answer needs the estimators, which take a tenth of a second
-    from avtorch.inference.estimators.importance import AGAINST_SGLD
+    from avtorch.inference.sequential import AGAINST_SGLD
 
     setting = estimates.setting
     return {

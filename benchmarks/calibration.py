@@ -22,8 +22,8 @@ from avtorch.inference.jerk import JerkDensity
 from avtorch.inference.priors import Prior
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings
-from avtorch.inference.sequential import Mode, SequentialInference
-from avtorch.validation.simulation import Amplitude, statistics
+from avtorch.inference.sequential import CarriedBy, SequentialInference
+from avtorch.validation.windows import Amplitude, statistics
 from benchmarks.rank_calibration import (
     LEVELS,
     RankCalibration,
@@ -100,7 +100,7 @@ def sbc_loop(
     replications: int = 4000,
     *,
     windows: int = 5,
-    mode: Mode = "posterior",
+    mode: CarriedBy = "posterior",
     truth: Literal["constant", "claimed"] | None = None,
     rows: int = 200,
     amplitude: Amplitude = VARIED,
@@ -187,7 +187,7 @@ def single(replications: int, seed: int) -> None:
 
 def loop(replications: int, seed: int, windows: int) -> None:
     print(f"\nSBC of the loop, {replications} vehicles, {windows} windows each, seed {seed}")
-    cases: list[tuple[Mode, str, object, ExcitationRule | None]] = [
+    cases: list[tuple[CarriedBy, str, object, ExcitationRule | None]] = [
         ("posterior", "constant", VARIED, None),
         ("posterior", "constant", WEAK, None),
         ("posterior", "claimed", VARIED, None),

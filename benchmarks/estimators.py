@@ -26,7 +26,7 @@ from torch import Tensor
 
 from avtorch.decision.algorithm2 import ACCEPTED_CHANGE
 from avtorch.inference import BeliefStream, Form, JerkForm, Window
-from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.latent import LatentForm
 from avtorch.io.log import STANDSTILL_MPS
 from avtorch.vehicle import Block, ClosedLoop, GLVDPlant, Leader
 

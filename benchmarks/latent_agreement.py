@@ -20,8 +20,7 @@ import torch
 from torch import Tensor
 
 from avtorch.inference.importance import ImportanceSettings, WeightedDraws, approximated, weighted_draws
-from avtorch.inference.latent import LatentDensity, LatentWindow
-from avtorch.inference.latent_form import SAMPLER, latent_excitation
+from avtorch.inference.latent import SAMPLER, LatentDensity, LatentWindow, latent_excitation
 from avtorch.inference.sampler import sample
 from avtorch.io import Log
 from tests.inference.latent_windows import drawn_window

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from avtorch.decision.grid import Grid
-from avtorch.decision.record import SupervisedRun
 from avtorch.decision.strategist import Strategist
 from avtorch.decision.supervisor import ALLOWED, Supervisor
+from avtorch.decision.watch import SupervisedRun
 from avtorch.vehicle import ClosedLoop, GLVDPlant, Leader
 
 HEALTHY = (0.3, 1.0)

@@ -30,12 +30,12 @@ from avtorch.inference.jerk import JerkDensity, JerkStatistics
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
 from avtorch.inference.quadrature import Quadrature, integrate
 from avtorch.inference.sampler import SamplerSettings
-from avtorch.inference.sequential import Mode, SequentialInference
-from avtorch.validation.simulation import Amplitude, statistics
+from avtorch.inference.sequential import CarriedBy, SequentialInference
+from avtorch.validation.windows import Amplitude, statistics
 
 SEED, AMPLITUDES = 20240602, (1.0, 0.3, 0.1)
 NAMES = ("T_L", "K_L", "sigma")
-MODES: tuple[Mode, ...] = ("lambda", "posterior", "forgetting")
+MODES: tuple[CarriedBy, ...] = ("lambda", "posterior", "forgetting")
 
 
 def pool(windows: Sequence[JerkStatistics]) -> JerkStatistics:
@@ -189,7 +189,9 @@ def windows_of(
     return [statistics(z, rows=rows, amplitude=amplitude, generator=generator) for z in path]
 
 
-def track_loop(path: Tensor, windows: Sequence[JerkStatistics], *, mode: Mode, seed: int = 0, **loop: Any) -> Track:
+def track_loop(
+    path: Tensor, windows: Sequence[JerkStatistics], *, mode: CarriedBy, seed: int = 0, **loop: Any
+) -> Track:
     """Run the loop over ``windows``, all of which are used, and keep its belief after each.
 
     Args:

@@ -19,7 +19,8 @@ from torch import Tensor
 from torch.distributions import HalfCauchy, HalfNormal, Normal
 from torch.distributions.constraints import positive, real
 
-from avtorch.inference import SamplerSettings, TorchDensity, sample
+from avtorch.inference import SamplerSettings, sample
+from benchmarks.torch_density import TorchDensity
 
 NAMES = {"arK-arK": "arK", "kidiq-kidscore_momiq": "kidiq", "sblrc-blr": "sblrc"}
 

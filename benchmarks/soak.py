@@ -29,8 +29,8 @@ import torch
 from scipy.stats import linregress, t
 
 from avtorch.arrays import FloatArray
-from avtorch.inference.stream_state import packed, unpacked
-from avtorch.io.atomic import atomic
+from avtorch.inference.stream import packed, unpacked
+from avtorch.io.answers import atomic
 from avtorch.io.log import STANDSTILL_MPS
 from avtorch.live import Answer, Batch, Counts, KeptCars, LineParser, LiveSettings, LiveWatch, Row, Stop, watch_source
 from avtorch.live.car import LiveWindow

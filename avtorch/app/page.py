@@ -19,7 +19,7 @@ from avtorch.app.workplace import MOST_MB, Workplace, examples
 from avtorch.errors import InputError, printable
 from avtorch.gap.quantity import words_of
 from avtorch.io import Log
-from avtorch.io.atomic import atomic
+from avtorch.io.answers import atomic
 from avtorch.io.formats import is_recording, open_recording
 from avtorch.io.mapping import mapping_place, read_mapping
 from avtorch.io.tables import read_table

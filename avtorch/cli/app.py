@@ -18,13 +18,13 @@ from cyclopts import App, CycloptsError, MissingArgumentError
 
 from avtorch.cli.arguments import COMMAND_LINE, free_folder
 from avtorch.cli.check import check
-from avtorch.cli.check_simulator import check_simulator
 from avtorch.cli.compare import compare
 from avtorch.cli.diagnose import diagnose
 from avtorch.cli.estimate import estimate
 from avtorch.cli.fleet import fleet
 from avtorch.cli.paper import paper
 from avtorch.cli.run import run
+from avtorch.cli.simulators import check_simulator
 from avtorch.cli.stability import stability
 from avtorch.cli.validate import validate
 from avtorch.cli.watch import watch

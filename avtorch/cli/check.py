@@ -38,7 +38,7 @@ def check(
     log
         A table of text in any layout, gzipped or not, or Parquet.
     """
-    from avtorch.io.atomic import atomic
+    from avtorch.io.answers import atomic
     from avtorch.io.mapping import mapping_beside, mapping_place
     from avtorch.logcheck.check import check as work
 

@@ -172,11 +172,12 @@ def _answer(
     from avtorch.report.comparison import comparison_tables
 
     if out is not None:
-        from avtorch.report import write_comparison_page
+        from avtorch.report import comparison_html
+        from avtorch.report.page import written
 
         notes = [f"{log.name}: {note}" for log in logs for note in check(log).notes]
         with answer_set(out, ("comparison.json", PAGE)) as staged:
-            write_comparison_page(found, staged, notes=notes, origin=origin)
+            written(comparison_html(found, notes=notes, origin=origin), staged, PAGE)
             write_json(staged / "comparison.json", found.to_dict())
         if open_page:
             talk.show(out / PAGE)

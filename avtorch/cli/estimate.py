@@ -142,8 +142,9 @@ def estimate(
         answer["command"] = about_map
 
     from avtorch import plots
-    from avtorch.report import write_estimates_page
+    from avtorch.report import estimates_html
     from avtorch.report.estimates import dead_time_note, estimates_note, late_note
+    from avtorch.report.page import written
     from avtorch.report.window_tables import P_WORDS, alert_table, window_table
 
     origin = origin_of(
@@ -153,7 +154,7 @@ def estimate(
 
     def page(staged: Path) -> None:
         write_pedals(fit, staged)
-        write_estimates_page(found, drive, staged, notes=notes, origin=origin)
+        written(estimates_html(found, drive, notes=notes, origin=origin), staged, PAGE)
 
     pictures = {
         "belief.png": lambda: plots.belief_figure(answer["windows"], answer=answer, log=drive),

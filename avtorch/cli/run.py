@@ -29,8 +29,8 @@ from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
-    from avtorch.decision.record import SupervisedRun
     from avtorch.decision.strategist import Strategist
+    from avtorch.decision.watch import SupervisedRun
     from avtorch.report import Origin
     from avtorch.vehicle import Block, ClosedLoop, Leader
 
@@ -195,7 +195,8 @@ def _write(
     origin: Origin,
 ) -> None:
     from avtorch import plots
-    from avtorch.report import write_run_page
+    from avtorch.report import run_html
+    from avtorch.report.page import written
     from avtorch.report.run import Regions
 
     time, rows = acting.rows.time, acting.rows
@@ -218,7 +219,8 @@ def _write(
     regions = Regions(settings, clouds)
 
     def page(staged: Path) -> None:
-        write_run_page(answer, time, traces, folder=staged, truth=truth, bounds=BOUNDS, regions=regions, origin=origin)
+        html = run_html(answer, time, traces, truth=truth, bounds=BOUNDS, regions=regions, origin=origin)
+        written(html, staged, PAGE)
 
     write_answer(out, "run.json", answer, pictures, more=page, also=(PAGE,))
 

@@ -116,12 +116,13 @@ def validate(
     origin = origin_of([] if log is None else [log], **given_settings, **more)
 
     from avtorch import plots
-    from avtorch.report.validation import validation_notes, validation_table, write_validation_page
+    from avtorch.report.page import written
+    from avtorch.report.validation import validation_html, validation_notes, validation_table
 
     groups = found.to_arviz()
     with answer_set(out, ("validation.json", PAGE, *plots.VALIDATION_PICTURES, *EXPORTS)) as staged:
         export(staged, groups)
-        write_validation_page(found, staged, origin=origin)
+        written(validation_html(found, origin=origin), staged, PAGE)
         write_answer(staged, "validation.json", answer, plots.validation_figures(found))
     if open_page:
         talk.show(out / PAGE)

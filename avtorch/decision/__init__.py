@@ -12,12 +12,11 @@ from avtorch.decision.algorithm2 import Algorithm2, algorithm2
 from avtorch.decision.estimation import Estimates, estimate
 from avtorch.decision.grid import Grid, Intrusiveness
 from avtorch.decision.monitor import DEFAULT_DETECTORS, DETECTORS, Monitor, MonitorReport
-from avtorch.decision.record import Action, Alert, SupervisedRun
 from avtorch.decision.replay import History, replay
 from avtorch.decision.settings import DesignBounds, Setting
 from avtorch.decision.strategist import Decision, Strategist
 from avtorch.decision.supervisor import Supervisor
-from avtorch.decision.watch import Watch, WatchedWindow
+from avtorch.decision.watch import Action, Alert, SupervisedRun, Watch, WatchedWindow
 
 __all__ = [
     "DEFAULT_DETECTORS",

@@ -16,9 +16,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import BoolArray, FloatArray
-from avtorch.inference.latent import LatentDensity
-from avtorch.inference.latent_form import latent_excitation
-from avtorch.inference.latent_window import LatentWindow
+from avtorch.inference.latent import LatentDensity, LatentWindow, latent_excitation
 from avtorch.inference.map import Mode, find_mode
 from avtorch.io.log import Log
 
@@ -38,15 +36,8 @@ CLEAR = 3.0
 class InferredDeadTime:
     """An inferred dead time.
 
-    Attributes:
-        seconds: the most likely one [s], 0 where none is clear (`CLEAR`).
-        q05, q95: the central 90 % of its posterior under a flat prior over the dead times tried [s].
-        nats: evidence of the most likely one over none.
-
-    Example:
-        >>> from avtorch.decision.dead_time import InferredDeadTime
-        >>> InferredDeadTime(0.0, 0.0, 0.06, 1.2).to_dict()
-        {'seconds': 0.0, 'q05': 0.0, 'q95': 0.06, 'nats': 1.2}
+    `seconds`: the most likely one [s], 0 where none is clear (`CLEAR`). `q05`, `q95`: the central 90 % of its posterior
+    under a flat prior over the dead times tried [s]. `nats`: evidence of the most likely one over none.
     """
 
     seconds: float

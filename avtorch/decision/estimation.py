@@ -26,13 +26,11 @@ from avtorch.display import Card, Displayed, Frame
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.inference.form import Form, JerkForm
-from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.latent import LatentForm
 from avtorch.inference.stream import BeliefStream
-from avtorch.io.log import Log
+from avtorch.io.log import Log, LogSource, as_log, no_command
 from avtorch.io.mapping import Pairs
-from avtorch.io.no_command import no_command
 from avtorch.io.quality import Quality, check, require_usable
-from avtorch.io.source import LogSource, as_log
 from avtorch.logcheck.late_channel import LateChannel, late_channel, on_time
 
 if TYPE_CHECKING:

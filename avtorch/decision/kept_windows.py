@@ -22,8 +22,7 @@ from avtorch.decision.settings import Setting
 from avtorch.decision.watch import Watch, WatchedWindow
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief
-from avtorch.inference.stream import Window
-from avtorch.inference.stream_state import packed, unpacked
+from avtorch.inference.stream import Window, packed, unpacked
 from avtorch.io import fingerprint, read_sealed_bytes, write_sealed
 from avtorch.io.log import Log
 from avtorch.version import __version__

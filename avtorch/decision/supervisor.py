@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 
 from avtorch.decision.monitor import Monitor
-from avtorch.decision.record import Action, Alert, SupervisedRun
 from avtorch.decision.replay import History
 from avtorch.decision.settings import Setting
 from avtorch.decision.strategist import Strategist
-from avtorch.decision.watch import Watch, WatchedWindow
+from avtorch.decision.watch import Action, Alert, SupervisedRun, Watch, WatchedWindow
 from avtorch.display.progress import asks_for_bar, called, progress_bar
 from avtorch.errors import InputError
 from avtorch.inference.form import JerkForm
-from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.latent import LatentForm
 from avtorch.inference.stream import BeliefStream
 from avtorch.io.log import STANDSTILL_MPS
 from avtorch.vehicle.block import Block

@@ -1,14 +1,14 @@
 """Simulators that are not avtorch's own: beside a car's log, as a baseline, and with the effects they lack."""
 
+from avtorch.external.compare_simulators import SimulatorComparison as SimulatorComparison
 from avtorch.external.compare_simulators import compare_simulators as compare_simulators
 from avtorch.external.external_simulator import ExternalSimulator as ExternalSimulator
 from avtorch.external.fmu import FmuSimulator as FmuSimulator
 from avtorch.external.fmu_export import write_fmu as write_fmu
 from avtorch.external.identification import SimulatorCheck as SimulatorCheck
 from avtorch.external.identification import check_simulator as check_simulator
-from avtorch.external.loading import load_simulator as load_simulator
 from avtorch.external.simulator import Simulator as Simulator
-from avtorch.external.simulator_comparison import SimulatorComparison as SimulatorComparison
+from avtorch.external.simulator import load_simulator as load_simulator
 from avtorch.external.wrap import wrap as wrap
 
 __all__ = [

@@ -11,9 +11,8 @@ from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 from avtorch.errors import InputError, listed, quoted
 from avtorch.external.adjusting import Adjusted, Rollouts, adjusted, fewest_rollouts
-from avtorch.external.alignment import aligned
 from avtorch.external.answer import lag_and_gain, responses, rollout_errors, with_simulator, without_discrepancy
-from avtorch.external.driving import driven_along, in_drives
+from avtorch.external.driving import aligned, driven_along, in_drives
 from avtorch.external.simulator import Limits, Simulator, values_of, with_values
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.result.diagnosis import Diagnosis

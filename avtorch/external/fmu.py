@@ -28,8 +28,7 @@ from avtorch.external import fmu_process
 from avtorch.external.fmu_process import NOT_RUNNING
 from avtorch.external.fmu_variables import SIGNALS, STARTS, Variable, ports
 from avtorch.io.mapping import mapping_beside
-from avtorch.io.opening import place
-from avtorch.io.toml import read_toml
+from avtorch.io.opening import place, read_toml
 
 OPENING_S = 120.0
 """For unpacking, for loading and for the begin of a drive: starting the tool behind an FMU can take a minute."""
@@ -120,16 +119,7 @@ class FmuSimulator:
         return (*notes, *self._start_notes)
 
     def parameters(self) -> dict[str, float]:
-        """The FMU's numeric parameters with the values of the next drive, in the FMU's own units.
-
-        Example:
-            >>> from avtorch.external import FmuSimulator, write_fmu
-            >>> from avtorch.gap import plant
-            >>> _ = write_fmu(plant(baseline="dead_time=0.2", T_L=0.4), "car.fmu")
-            >>> with FmuSimulator("car.fmu") as car:
-            ...     car.with_parameters({"T_L": 0.5}).parameters()["T_L"]
-            0.5
-        """
+        """The FMU's numeric parameters with the values of the next drive, in the FMU's own units."""
         return {name: self._values.get(name, v.start) for name, v in self._settable().items() if v.start is not None}
 
     def with_parameters(self, values: Mapping[str, float]) -> FmuSimulator:

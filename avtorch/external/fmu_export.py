@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 from avtorch.errors import InputError
 from avtorch.gap.simulator.around import Around
 from avtorch.gap.simulator.plant import GapPlant
-from avtorch.io.atomic import atomic
-from avtorch.io.formats.kinds import Kind, Library
-from avtorch.io.formats.library import library, refuse_missing
+from avtorch.io.answers import atomic
+from avtorch.io.formats.kinds import Kind, Library, library, refuse_missing
 from avtorch.io.opening import place
 
 if TYPE_CHECKING:

@@ -10,10 +10,8 @@ import numpy as np
 
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.mapping import PEDALS
-from avtorch.io.unit_names import unit_named
-from avtorch.io.units import to_si
-from avtorch.logcheck.header import header_of
-from avtorch.logcheck.vocabulary import likeness
+from avtorch.io.units import to_si, unit_named
+from avtorch.logcheck.vocabulary import header_of, likeness
 
 SIGNALS = ("accel_cmd", "accel", "speed")
 STARTS = ("speed0", "accel0")

@@ -1,18 +1,24 @@
-"""A simulator that is not avtorch's own: what it has to have, the numbers it lets one set, and a plant as one."""
+"""A simulator that is not avtorch's own: what it has to have, the numbers it lets one set, a plant as one; loading."""
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import math
+import sys
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import fields, is_dataclass, replace
 from inspect import getattr_static
+from os import PathLike
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
+from avtorch.external.fmu import FmuSimulator
 from avtorch.gap.simulator.plant import GapPlant
 
 
@@ -130,3 +136,53 @@ class DrivenPlant:
         u = torch.tensor([accel_cmd], dtype=torch.float64)
         self._accel, self._speed, _ = self._plant.step(self._accel, self._speed, u, dt, torch.zeros_like(u))
         return float(self._accel), float(self._speed)
+
+
+def load_simulator(text: str, *, mapping: str | PathLike[str] | None = None) -> Simulator:
+    """The simulator called `module:name` (`package.module:Class`, `module:make`), in a file (`car.py:Car`), or an FMU.
+
+    A class is instantiated, a function called, both without arguments; of a function, its value is the simulator.
+    `mapping`: a TOML file that names an FMU's variables, see `FmuSimulator`.
+    Raises `InputError` for a text of another form, a module or name that is not there, what cannot be made, or an
+    object without `reset` and `step`.
+    """
+    if text.lower().endswith(".fmu"):
+        return FmuSimulator(text, mapping=mapping)
+    home, colon, name = text.rpartition(":")
+    if not colon or not home or not name.isidentifier():
+        raise InputError(
+            f"simulator: found {quoted(text)}, needs MODULE:NAME, such as my_car:Car or path/my_car.py:Car, or an FMU"
+        )
+    module = _module(home)
+    if not hasattr(module, name):
+        raise InputError(f"simulator: {home} has no {name}")
+    found = getattr(module, name)
+    if inspect.isclass(found) or (callable(found) and not isinstance(found, Simulator)):
+        try:
+            found = found()
+        except Exception as error:
+            what = (
+                f"simulator: {text} raised {type(error).__name__} when called without arguments; {quoted(str(error))}"
+            )
+            raise InputError(what) from error
+    if not isinstance(found, Simulator):
+        missing = " and ".join(n for n in ("reset", "step") if not callable(getattr(found, n, None)))
+        raise InputError(f"simulator: {text} has no {missing}; needs reset(speed, accel) and step(accel_cmd, dt)")
+    return found
+
+
+def _module(home: str) -> object:
+    here = str(Path.cwd())
+    if home.endswith(".py"):
+        path = Path(home)
+        if not path.is_file():
+            raise InputError(f"simulator: {home}: no such file")
+        here, home = str(path.resolve().parent), path.stem
+    if here not in sys.path:
+        sys.path.insert(0, here)  # as `python -m` has it
+    try:
+        return importlib.import_module(home)
+    except Exception as error:
+        raise InputError(
+            f"simulator: {home} could not be imported; {type(error).__name__}: {quoted(str(error))}"
+        ) from error

@@ -27,7 +27,7 @@ from avtorch.gap.simulator.simulator_input import SimulatorInput
 from avtorch.io import Log
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.engagement import SETTLE_S
-from avtorch.io.no_command import no_command
+from avtorch.io.log import no_command
 
 RATE_HZ = 20.0
 """Rows are averaged as long as the resulting rate is at least this [Hz]."""

@@ -29,7 +29,6 @@ from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.inference.sequential import SequentialInference
 from avtorch.inference.sgld import SGLD
 from avtorch.inference.stream import BeliefStream, Window
-from avtorch.inference.torch_density import TorchDensity
 
 __all__ = [
     "SGLD",
@@ -52,7 +51,6 @@ __all__ = [
     "SelectableDensity",
     "SequentialInference",
     "SubsampledDensity",
-    "TorchDensity",
     "Window",
     "WindowLikelihood",
     "find_mode",

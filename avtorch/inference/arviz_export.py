@@ -1,4 +1,4 @@
-"""Draws as ArviZ data, for its plots and diagnostics. Needs the extra ``arviz``, which is imported when it is used."""
+"""Units of the parameters, and draws as ArviZ data, which needs the extra ``arviz``, imported when it is used."""
 
 from __future__ import annotations
 
@@ -9,10 +9,28 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 
 from avtorch.errors import InputError
-from avtorch.inference.units import UNITS as UNITS
 
 if TYPE_CHECKING:
     from arviz import InferenceData
+
+UNITS = {
+    "T_L": "s",
+    "K_L": "1",
+    "sigma": "m/s^3",
+    "process_noise": "m/s^2/sqrt(s)",
+    "road_noise": "m/s/sqrt(s)",
+    "speed_noise": "m/s",
+    "accel_noise": "m/s^2",
+    "coloured_sd": "m/s^2",
+    "coloured_time": "s",
+}
+"""By parameter, as ArviZ and xarray write units."""
+
+
+def shown_unit(name: str) -> str:
+    """A parameter's unit as tables show it: ``m/s²``, ``-`` for none; empty for a parameter that is not known."""
+    unit = UNITS.get(name, "")
+    return "-" if unit == "1" else unit.replace("^2", "²").replace("^3", "³").replace("sqrt(s)", "√s")
 
 
 def inference_data(
@@ -27,8 +45,7 @@ def inference_data(
     A unit goes to the variable's ``attrs["units"]``. ArviZ 1.x has ``xarray.DataTree`` in place of ``InferenceData``:
     ``DataTree.from_dict({"posterior": data.posterior})`` carries over.
 
-    Raises:
-        InputError: where ArviZ is not installed, or there are no draws.
+    Raises `InputError` where ArviZ is not installed, or there are no draws.
     """
     if not all(x.size for x in draws.values()) or not draws:
         raise InputError("draws: found none; to_arviz needs posterior draws")

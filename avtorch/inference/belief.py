@@ -11,11 +11,11 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float, Int
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
+from avtorch.inference.arviz_export import UNITS, shown_unit
 from avtorch.inference.device import Device
 from avtorch.inference.posterior import quantile_of
 from avtorch.inference.priors import Prior
 from avtorch.inference.state import shaped_as
-from avtorch.inference.units import UNITS, shown_unit
 
 if TYPE_CHECKING:
     import pandas
@@ -44,8 +44,7 @@ class Summary(NamedTuple):
     ) -> Summary:
         """Summary of parameters with normal logarithms: moments and quantiles in closed form, and ``kept`` draws.
 
-        Args:
-            mean_z: ``(vehicle, parameter)``. cov_z: ``(vehicle, parameter, parameter)``, positive semidefinite.
+        `mean_z`: ``(vehicle, parameter)``. cov_z: ``(vehicle, parameter, parameter)``, positive semidefinite.
         """
         sd_z = cov_z.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
         mean = (mean_z + 0.5 * sd_z.square()).exp()
@@ -67,14 +66,6 @@ class Belief(Displayed):
         excited: ``(vehicle,)`` bool; where false the window was not used and the rest is carried over unchanged.
         converged: ``(vehicle,)`` bool; false where the window was excited but its chains did not settle: carried over,
             too. In the latent form true means only that the chains agree (see `Posterior`).
-
-    Example:
-        >>> from avtorch.inference import SequentialInference
-        >>> belief = SequentialInference(vehicles=3).belief  # before any window: the first prior
-        >>> belief.names, tuple(belief.draws.shape), belief.excited.tolist()
-        (('T_L', 'K_L', 'sigma'), (1000, 3, 3), [False, False, False])
-        >>> sorted(belief.stat("T_L", vehicle=2))
-        ['mean', 'q05', 'q95', 'sd']
     """
 
     names: tuple[str, ...]
@@ -168,8 +159,7 @@ class Belief(Displayed):
     def taken_from(self, state: dict[str, Any]) -> Belief:
         """The inverse of :meth:`state_dict`, for the same parameters, vehicles and draws; other entries are ignored.
 
-        Raises:
-            InputError: for other parameters, shapes or types.
+        Raises `InputError` for other parameters, shapes or types.
         """
         own = self.state_dict()
         shaped_as(own, {key: state[key] for key in own if key in state}, "state")

@@ -19,7 +19,7 @@ from avtorch.errors import InputError
 from avtorch.inference.coordinates import Coordinates
 from avtorch.inference.density import Density
 from avtorch.inference.exponential_form import ExponentialForm, has_form, outdated
-from avtorch.inference.pareto import tail_of
+from avtorch.inference.importance import tail_of
 from avtorch.inference.planes import empty_planes, to_planes
 from avtorch.inference.sampler_settings import SamplerSettings
 
@@ -189,8 +189,7 @@ def whitened(form: ExponentialForm, coordinates: Coordinates) -> tuple[np.ndarra
 def chosen(density: Density, settings: SamplerSettings) -> Compiled | None:
     """The compiled loops for a walk by these settings; ``None`` for the eager walk.
 
-    Raises:
-        InputError: where the settings ask for compiled loops that cannot be had.
+    Raises `InputError` where the settings ask for compiled loops that cannot be had.
     """
     if settings.walk == "eager":
         return None

@@ -20,9 +20,7 @@ Whitening = Literal["full", "diagonal", "none"]
 class Coordinates:
     """``z = mode + lower @ w``.
 
-    Attributes:
-        mode: ``(window, d)``.
-        lower: lower triangular, ``(window, d, d)``.
+    `mode`: ``(window, d)``. `lower`: lower triangular, ``(window, d, d)``.
     """
 
     mode: Float[Tensor, "window d"]

@@ -15,18 +15,6 @@ class Density(Protocol):
 
     The potential of a Langevin sampler is ``U(z) = -log_prob(z)``, on the scale of the *whole* window, never a mean
     over its points.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import Density, integrate
-        >>> class Normal:  # log(lag) ~ Normal(-1, 0.1)
-        ...     names, windows = ("T_L",), 1
-        ...     def log_prob(self, z):
-        ...         return -(((z[..., 0] + 1) / 0.1) ** 2) / 2
-        ...     def initial(self):
-        ...         return torch.zeros(1, 1, dtype=torch.float64)
-        >>> round(float(integrate(Normal()).quantile(0.5)), 3)  # exp(-1)
-        0.368
     """
 
     @property
@@ -53,18 +41,7 @@ class Density(Protocol):
 
 @runtime_checkable
 class SubsampledDensity(Density, Protocol):
-    """A density that can also be estimated from a minibatch of its points (SGLD proper).
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import JerkPoints, SubsampledDensity
-        >>> a, u, noise = torch.randn(3, 1, 500, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-        >>> points: SubsampledDensity = JerkPoints(a, u, (0.9 * u - a) / 0.5 + 0.1 * noise)
-        >>> z, batches = points.initial(), torch.arange(500).reshape(5, 100)
-        >>> mean = sum(points.log_prob_minibatch(z, batch) for batch in batches) / 5
-        >>> bool(torch.allclose(mean, points.log_prob(z)))  # unbiased: over all batches, the whole window's
-        True
-    """
+    """A density that can also be estimated from a minibatch of its points (SGLD proper)."""
 
     @property
     def points(self) -> int:
@@ -80,18 +57,7 @@ class SubsampledDensity(Density, Protocol):
 
 @runtime_checkable
 class ScoredDensity(Density, Protocol):
-    """A density that gives its gradient in closed form, which the sampler then uses instead of autograd.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import ScoredDensity
-        >>> from avtorch.validation import synthetic_windows
-        >>> density: ScoredDensity = synthetic_windows(1, seed=1).density
-        >>> z = density.initial().requires_grad_()
-        >>> slope, = torch.autograd.grad(density.log_prob(z).sum(), z)
-        >>> bool(torch.allclose(slope, density.score(z)))
-        True
-    """
+    """A density that gives its gradient in closed form, which the sampler then uses instead of autograd."""
 
     def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
         """Gradient of ``log_prob`` in ``z``, shape ``(..., window, parameter)``."""
@@ -100,16 +66,7 @@ class ScoredDensity(Density, Protocol):
 
 @runtime_checkable
 class SelectableDensity(Density, Protocol):
-    """A density whose windows can be taken apart, so that a sampler works on those that need it.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import SelectableDensity
-        >>> from avtorch.validation import synthetic_windows
-        >>> density: SelectableDensity = synthetic_windows(5, seed=1).density
-        >>> density.select(torch.tensor([0, 3])).windows
-        2
-    """
+    """A density whose windows can be taken apart, so that a sampler works on those that need it."""
 
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Density:
         """The windows named by ``index``, integers or bool."""
@@ -118,17 +75,7 @@ class SelectableDensity(Density, Protocol):
 
 @runtime_checkable
 class ConstrainedDensity(Density, Protocol):
-    """A density whose parameters are not all positive, or not ``exp(z)``.
-
-    Example:
-        >>> import torch
-        >>> from torch.distributions import Beta, constraints
-        >>> from avtorch.inference import ConstrainedDensity, TorchDensity
-        >>> unit = {"x": constraints.unit_interval}
-        >>> share: ConstrainedDensity = TorchDensity(lambda p: Beta(2.0, 3.0).log_prob(p["x"]), unit)
-        >>> share.constrain(torch.zeros(1, 1)).tolist()
-        [[0.5]]
-    """
+    """A density whose parameters are not all positive, or not ``exp(z)``."""
 
     def constrain(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
         """Parameters in their own units, each from its own entry of ``z``, shape of ``z``."""

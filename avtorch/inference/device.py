@@ -21,8 +21,7 @@ Device = str | torch.device
 def checked_device(device: Device) -> torch.device:
     """The device, once a double was written there and read back.
 
-    Raises:
-        InputError: for a name that is none, a device that this machine lacks, and one without double precision.
+    Raises `InputError` for a name that is none, a device that this machine lacks, and one without double precision.
     """
     try:
         tried = torch.ones(1, dtype=torch.float64, device=device)

@@ -3,7 +3,7 @@ r"""Do the draws of a walk follow the density? Chains that agree with each other
 A constant step has a law of its own, and chains that all begin at the mode may not have reached the posterior's tails.
 The log density is exact and cheap, so it serves as the test: points are drawn from a proposal around the draws, a
 mixture of normals with the draws' mean and covariance and 1 to 15 times their SDs, and weighed by ``density /
-proposal``. If the ratios are reliable (Pareto-k, :mod:`avtorch.inference.pareto`), their weighted moments are the
+proposal``. If the ratios are reliable (Pareto-k, :mod:`avtorch.inference.importance`), their weighted moments are the
 posterior's, with a Monte Carlo error that is known, and those of the draws are compared with them. If the ratios are
 not reliable, the draws do not cover the density, or its shape is too far from normal for this test: then nothing is
 claimed.
@@ -25,8 +25,8 @@ from avtorch.arrays import Bool, Float, Int
 from avtorch.inference.compiled import Compiled, Unavailable, compiled
 from avtorch.inference.coordinates import Coordinates, score_of
 from avtorch.inference.density import Density, has_selection
+from avtorch.inference.importance import RELIABLE, pareto_k
 from avtorch.inference.map import find_mode
-from avtorch.inference.pareto import RELIABLE, pareto_k
 from avtorch.inference.planes import from_planes, lower_times, lower_transposed_times, to_planes
 
 MEAN_TOLERANCE, SD_TOLERANCE, TAIL_TOLERANCE = 0.1, 0.05, 0.003
@@ -352,9 +352,8 @@ def missed_mass(
 ) -> Float[Tensor, " window"]:
     """Mass of the heaviest mode found far from the draws, over that at the draws, ``(window,)``; 0 where none was.
 
-    Args:
-        mean, lower: the draws' mean ``(window, parameter)`` and triangular root of their covariance.
-        eager: without compiled loops.
+    `mean`, `lower`: the draws' mean ``(window, parameter)`` and triangular root of their covariance. `eager`: without
+    compiled loops.
     """
     missed, loops = mean.new_zeros(len(mean)), Unavailable("not asked for") if eager else compiled(density)
     try:

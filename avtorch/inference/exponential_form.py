@@ -85,14 +85,6 @@ class ExponentialForm:
         exponents: ``E``, ``(3, 3)``.
         offsets: ``c``, ``(3,)``.
         coupling: ``C``, symmetric, ``(window, 3, 3)``.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.validation import synthetic_windows
-        >>> density = synthetic_windows(2, seed=1).density
-        >>> z = density.initial()
-        >>> bool(torch.allclose(density.exponential_form().potential(z), -density.log_prob(z)))
-        True
     """
 
     terms: PotentialTerms

@@ -26,20 +26,8 @@ Rows = Mapping[str, Tensor]
 class WindowLikelihood:
     """The likelihood of one window of every vehicle: with a prior it gives a posterior density.
 
-    Attributes:
-        n: usable rows, ``(vehicle,)``.
-        excited: ``(vehicle,)`` bool, by the fixed rule.
-        density: the posterior density of the vehicles named by an index, from their priors.
-
-    Example:
-        >>> import torch
-        >>> from avtorch import GLVDPlant, Leader, simulate
-        >>> from avtorch.inference import JerkForm
-        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-        >>> rows = {"accel": run.accel[:, 0], "accel_cmd": run.accel_cmd[:, 0], "jerk": run.jerk[:, 0]}
-        >>> likelihood = JerkForm().likelihood({**rows, "usable": torch.ones(1, 200, dtype=torch.bool)}, full=200)
-        >>> likelihood.n.tolist(), likelihood.excited.tolist()
-        ([200.0], [True])
+    `n`: usable rows, ``(vehicle,)``. `excited`: ``(vehicle,)`` bool, by the fixed rule. `density`: the posterior
+    density of the vehicles named by an index, from their priors.
     """
 
     n: Real[Tensor, " vehicle"]
@@ -48,15 +36,7 @@ class WindowLikelihood:
 
 
 class Form(Protocol):
-    """A form of the log density: its columns, its parameters, and the likelihood of a window of rows.
-
-    Example:
-        >>> from avtorch.inference import Form, JerkForm
-        >>> from avtorch.inference.latent_form import LatentForm
-        >>> forms: list[Form] = [JerkForm(), LatentForm(accel=False, speed=True)]
-        >>> [form.columns for form in forms]
-        [('accel_cmd', 'accel', 'jerk'), ('accel_cmd', 'speed')]
-    """
+    """A form of the log density: its columns, its parameters, and the likelihood of a window of rows."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -87,20 +67,9 @@ class ExcitationRule:
     vehicle: for one much quicker than the reference (a lag of 0.05 s, say) it excludes some windows that would resolve
     it.
 
-    Attributes:
-        T_ref, K_ref: reference lag [s] and gain [-], slow enough that a degraded vehicle is resolved, too.
-        sd_T, sd_K: the widest predicted SDs of ``T_L`` [s] and ``K_L`` [-]: the paper's accepted changes.
-        share: the least share of the window's rows that must be usable.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import ExcitationRule, JerkStatistics
-        >>> t = torch.linspace(0.0, 2.0, 200, dtype=torch.float64)
-        >>> u = torch.stack([torch.sin(3 * t), 0.01 * torch.sin(3 * t)])  # a lively window and a calm one
-        >>> noise = 0.1 * torch.randn(200, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-        >>> sums = JerkStatistics.from_samples(0.8 * u.roll(30, -1), u, 2 * u - 1.6 * u.roll(30, -1) + noise)
-        >>> ExcitationRule()(sums, rows=200).tolist()
-        [True, False]
+    `T_ref`, `K_ref`: reference lag [s] and gain [-], slow enough that a degraded vehicle is resolved, too. `sd_T`,
+    `sd_K`: the widest predicted SDs of ``T_L`` [s] and ``K_L`` [-]: the paper's accepted changes. `share`: the least
+    share of the window's rows that must be usable.
     """
 
     T_ref: float = 1.0
@@ -133,15 +102,7 @@ class ExcitationRule:
 
 
 class JerkForm:
-    """Jerk is measured: Eq. 4 of the paper from six sums.
-
-    Example:
-        >>> from avtorch.inference import BeliefStream, ExcitationRule, JerkForm
-        >>> strict = JerkForm(rule=ExcitationRule(sd_T=0.1, sd_K=0.1))  # uses fewer windows, each of them sharper
-        >>> stream = BeliefStream(window=2.0, form=strict)
-        >>> strict.names, strict.columns
-        (('T_L', 'K_L', 'sigma'), ('accel_cmd', 'accel', 'jerk'))
-    """
+    """Jerk is measured: Eq. 4 of the paper from six sums."""
 
     names = ("T_L", "K_L", "sigma")
     columns = ("accel_cmd", "accel", "jerk")

@@ -35,22 +35,11 @@ def jerk_log_likelihood(
 ) -> Float[Tensor, "*batch"]:
     """Log likelihood of a window of measured jerk (Eq. 4 with Eq. 1), differentiable in every argument.
 
-    Args:
-        T_L, K_L, sigma: lag [s], gain [-], jerk noise [m/s^3]; shape ``(...)``.
-        a, u, jerk: realised and demanded acceleration [m/s^2], jerk [m/s^3]; shape ``(..., time)``.
+    `T_L`, `K_L`, `sigma`: lag [s], gain [-], jerk noise [m/s^3]; shape ``(...)``. `a`, `u`, `jerk`: realised and
+    demanded acceleration [m/s^2], jerk [m/s^3]; shape ``(..., time)``.
 
     Returns:
         Sum over time, shape ``(...)``.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import jerk_log_likelihood
-        >>> u = torch.sin(torch.linspace(0.0, 6.0, 200, dtype=torch.float64))
-        >>> a, T_L = 0.5 * u.roll(30), torch.tensor([0.3, 0.5], dtype=torch.float64)
-        >>> jerk = (0.9 * u - a) / 0.5
-        >>> log_p = jerk_log_likelihood(T_L, torch.tensor(0.9), torch.tensor(0.1), a, u, jerk)
-        >>> log_p.argmax().item()  # the lag of 0.5 s made the jerk
-        1
     """
     residual = jerk - glvd_jerk(a, u, T_L.unsqueeze(-1), K_L.unsqueeze(-1))
     return -0.5 * (residual / sigma.unsqueeze(-1)).square().sum(-1) - jerk.shape[-1] * (sigma.log() + 0.5 * _LOG_2PI)
@@ -61,15 +50,6 @@ class JerkStatistics:
     """Six sums over a window and its number of points: all that Eq. 4 needs, so its cost does not grow with the points.
 
     Every field has shape ``(window,)``; ``aj`` is the sum of ``a * jerk`` and so on.
-
-    Example:
-        >>> from avtorch import GLVDPlant, Leader, simulate
-        >>> from avtorch.inference import JerkStatistics
-        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-        >>> sums = JerkStatistics.from_samples(run.accel[:, 0], run.accel_cmd[:, 0], run.jerk[:, 0])
-        >>> inverse_lag, slope, sigma = sums.least_squares()
-        >>> round(float(1 / inverse_lag), 1), round(float(slope / inverse_lag), 1)
-        (0.5, 0.9)
     """
 
     n: Float[Tensor, " window"]
@@ -132,14 +112,6 @@ class JerkDensity:
     """Posterior of ``(T_L [s], K_L [-], sigma [m/s^3])`` of every window, from the six sums and a prior.
 
     It is the log density of :func:`jerk_log_likelihood` plus the prior, written in the sums.
-
-    Example:
-        >>> from avtorch import GLVDPlant, Leader, simulate
-        >>> from avtorch.inference import JerkDensity, JerkStatistics, find_mode
-        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-        >>> sums = JerkStatistics.from_samples(run.accel[:, 0], run.accel_cmd[:, 0], run.jerk[:, 0])
-        >>> [round(x, 1) for x in find_mode(JerkDensity(sums)).z.exp()[0].tolist()]  # T_L [s], K_L [-], sigma [m/s³]
-        [0.5, 0.9, 0.1]
     """
 
     names = ("T_L", "K_L", "sigma")

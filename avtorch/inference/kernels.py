@@ -339,7 +339,7 @@ def _mean_log(x, b):
 @njit("void(float64[:,::1], float64[::1])", cache=True, **_OPTIONS)
 def pareto_shapes(largest, out):
     """Of each window's largest log ratios ``(window, tail + 1)``, falling and none of them NaN, what
-    :func:`avtorch.inference.pareto.pareto_k` has of all."""
+    :func:`avtorch.inference.importance.pareto_k` has of all."""
     tail = largest.shape[1] - 1
     count = 30 + int(math.sqrt(tail))
     x, steps, profile = np.empty(tail), np.empty(count), np.empty(count)
@@ -375,10 +375,9 @@ def weigh(
 ):  # fmt: skip
     """Log importance ratios ``(window, point)`` of the windows ``first`` to ``last``, and the moments by them.
 
-    Args:
-        out: ``(window, 3, 6)``: mean, variance and share beyond ``tail`` of each direction, and their errors.
-        points: ``(3, point)``, the second half mirror images of the first; in ``w`` as the potential.
-        axes: ``(window, 3, 3)``: a direction is a row times a point.
+    `out`: ``(window, 3, 6)``: mean, variance and share beyond ``tail`` of each direction, and their errors. `points`:
+    ``(3, point)``, the second half mirror images of the first; in ``w`` as the potential. `axes`: ``(window, 3, 3)``: a
+    direction is a row times a point.
     """
     count = points.shape[1]
     weight = np.zeros(count)
@@ -416,9 +415,8 @@ def climb(
 ):  # fmt: skip
     """Ascents of the density from LANES points ``start`` ``(3 LANES,)``, each of ``steps`` no longer than ``stride``.
 
-    Args:
-        ends: ``(window, 3, LANES)``: where they end, in ``w``; 0 for what is not finite.
-        heights: ``(window, LANES)``: log density there, less that at ``w = 0``.
+    `ends`: ``(window, 3, LANES)``: where they end, in ``w``; 0 for what is not finite. `heights`: ``(window, LANES)``:
+    log density there, less that at ``w = 0``.
     """
     slope, origin, nought = np.zeros(3 * LANES), np.zeros(1), np.zeros((3, 1))
     for window in range(first, last):

@@ -1,20 +1,142 @@
-"""The log density where only noisy acceleration and/or speed are measured: nothing is ever differenced."""
+"""The latent form: only noisy acceleration and/or speed are measured, and nothing is ever differenced.
+
+Which windows of a stream are excited is a fixed rule, independent of the posterior.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from copy import copy
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Bool, Float, Int
+from avtorch.arrays import Bool, Float, Int, Real
 from avtorch.errors import InputError
 from avtorch.inference.compiled import Unavailable, load_kernels
+from avtorch.inference.device import Device
+from avtorch.inference.form import Rows, WindowLikelihood
 from avtorch.inference.latent_model import ACCEL_SD0, SPEED_SD0, latent_log_likelihood
-from avtorch.inference.latent_window import LatentWindow
 from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior, prior_on
+from avtorch.inference.sampler_settings import SamplerSettings
+
+#: A step longer than this many median steps is a gap: the filter starts afresh behind it.
+GAP = 2.5
+
+
+@dataclass(frozen=True)
+class LatentWindow:
+    """Rows of one or many windows, ``(window, time)`` float64, shorter ones padded at the end with ``mask`` False.
+
+    ``time`` [s]; ``u`` [m/s²] held from its row to the next; ``accel`` [m/s²] and/or ``speed`` [m/s] as measured, or
+    None; ``mask`` True where a row may be used (engaged, moving).
+    """
+
+    time: Float[Tensor, "window time"]
+    u: Float[Tensor, "window time"]
+    accel: Float[Tensor, "window time"] | None
+    speed: Float[Tensor, "window time"] | None
+    mask: Bool[Tensor, "window time"]
+
+    def __post_init__(self) -> None:
+        if self.accel is None and self.speed is None:
+            raise InputError("accel, speed: neither was given; the latent form needs at least one measured signal")
+        if self.time.ndim != 2:
+            raise InputError(f"time: has {self.time.ndim} dimensions; expected 2, (window, time)")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is not None and value.shape != self.time.shape:
+                raise InputError(f"{field.name}: has shape {tuple(value.shape)}; time has {tuple(self.time.shape)}")
+        if bool(((self.time.diff() <= 0) & self.mask[:, 1:] & self.mask[:, :-1]).any()):
+            raise InputError("time: does not increase from row to row")
+        for name in ("u", "accel", "speed"):
+            value = getattr(self, name)
+            if value is not None and not bool(torch.isfinite(value[self.mask]).all()):
+                raise InputError(f"{name}: is not finite in every row that is used")
+
+    @property
+    def windows(self) -> int:
+        return self.time.shape[0]
+
+    @classmethod
+    def single(
+        cls,
+        time: Real[Tensor, " time"],
+        u: Real[Tensor, " time"],
+        *,
+        accel: Real[Tensor, " time"] | None = None,
+        speed: Real[Tensor, " time"] | None = None,
+        mask: Bool[Tensor, " time"] | Real[Tensor, " time"] | None = None,
+    ) -> LatentWindow:
+        """One window from rows ``(time,)``."""
+
+        def row(value: Tensor | None) -> Tensor | None:
+            return None if value is None else torch.as_tensor(value, dtype=torch.float64)[None]
+
+        t = torch.as_tensor(time, dtype=torch.float64)[None]
+        c = torch.as_tensor(u, dtype=torch.float64)[None]
+        used = torch.ones_like(t, dtype=torch.bool) if mask is None else torch.as_tensor(mask, dtype=torch.bool)[None]
+        return cls(t, c, row(accel), row(speed), used)
+
+    @classmethod
+    def stack(cls, windows: Sequence[LatentWindow]) -> LatentWindow:
+        """Many windows as one, padded to the longest."""
+        longest = max(w.time.shape[1] for w in windows)
+
+        def pad(value: Tensor) -> Tensor:
+            return torch.nn.functional.pad(value, (0, longest - value.shape[1]))
+
+        def measured(name: str) -> Tensor | None:
+            given = [pad(v) for w in windows if (v := getattr(w, name)) is not None]
+            if 0 < len(given) < len(windows):
+                raise InputError(f"{name}: measured in some windows only; give it for all of them or for none")
+            return torch.cat(given) if given else None
+
+        time, u, mask = (torch.cat([pad(getattr(w, name)) for w in windows]) for name in ("time", "u", "mask"))
+        return cls(time, u, measured("accel"), measured("speed"), mask)
+
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> LatentWindow:
+        """The windows named by ``index``."""
+        accel = None if self.accel is None else self.accel[index]
+        speed = None if self.speed is None else self.speed[index]
+        return LatentWindow(self.time[index], self.u[index], accel, speed, self.mask[index])
+
+    def to(self, device: Device) -> LatentWindow:
+        """The same rows on another device."""
+        accel, speed = (None if x is None else x.to(device) for x in (self.accel, self.speed))
+        return LatentWindow(self.time.to(device), self.u.to(device), accel, speed, self.mask.to(device))
+
+    def runs(self) -> tuple[LatentWindow, Int[Tensor, " run"]]:
+        """Stretches without a gap or an unused row, one a row, and the window ``(run,)`` each comes from.
+
+        After a gap, a standstill or a driver's override the acceleration is unknown, so each run starts afresh.
+        """
+        pieces: list[LatentWindow] = []
+        owner: list[int] = []
+        for w in range(self.windows):
+            rows = self.mask[w].nonzero()[:, 0]
+            if not len(rows):
+                continue
+            step = self.time[w, rows].diff()
+            usual = step.median() if len(step) else torch.tensor(0.0)
+            cut = ((rows.diff() > 1) | (step > GAP * usual)).nonzero()[:, 0] + 1
+            for piece in torch.tensor_split(rows, cut.cpu()):
+                pieces.append(
+                    LatentWindow.single(
+                        self.time[w, piece],
+                        self.u[w, piece],
+                        accel=None if self.accel is None else self.accel[w, piece],
+                        speed=None if self.speed is None else self.speed[w, piece],
+                    )
+                )
+                owner.append(w)
+        if not pieces:
+            raise InputError("mask: no row of any window may be used")
+        return LatentWindow.stack(pieces), torch.tensor(owner, device=self.time.device)
+
 
 #: Rows count as even while their times are this close to an even grid: a quarter of a step, and 2.5 ms. The error in
 #: speed is 2.5 mm/s per m/s², below the noise of a wheel speed. For even rows the model is discretised once, for others
@@ -214,3 +336,141 @@ def _speed_noise(runs: LatentWindow, owner: Int[Tensor, " run"], windows: int) -
     each = bend.sum(-1) / rows / (12.0 / torch.pi) ** 0.5
     # A later run of a window overwrites an earlier one; any will do.
     return each.new_full((windows,), 0.01).index_copy(0, owner, each).clamp(1e-4, 1.0)
+
+
+#: Each step runs a filter over the rows for every chain, so there are fewer and longer chains. Some parameters are
+#: determined by little more than their prior, and their posteriors are so far from normal that importance sampling
+#: around the draws does not determine their moments; convergence is tested on the chains alone.
+SAMPLER = SamplerSettings(chains=64, draws=20, burn_in=12, thinning=1, step=1.5, longest=3.0, compare=False)
+#: Reference vehicle at which the information is predicted: lag [s], gain [-].
+REFERENCE = (0.3, 1.0)
+#: Noise level at which it is predicted: the medians of the noise priors.
+REFERENCE_NOISE = {name: median for name, (median, _) in NOISE_PRIOR.items()}
+#: SDs of log T_L and log K_L under the first prior.
+KNOWN = (0.7, 0.3)
+#: A window is excited from one bit on: where it is expected to halve the area of the belief about (T_L, K_L).
+LEAST_BITS = 1.0
+
+
+class LatentForm:
+    """Windows of ``accel_cmd`` with measured ``accel`` and/or ``speed``, for :class:`LatentDensity`.
+
+    `accel`, `speed`: which of the two is measured. `noise`: noise level at which excitation is predicted, by name (see
+    :func:`latent_excitation`). `share`: the least share of a window's rows that must be usable; the state at the start
+    of a run is unknown, so that a short end of a drive is less informative than its rows suggest.
+    """
+
+    sampler = SAMPLER
+
+    def __init__(
+        self,
+        *,
+        accel: bool,
+        speed: bool,
+        noise: Mapping[str, float] | None = None,
+        noise_prior: Prior | None = None,
+        share: float = 0.75,
+    ) -> None:
+        self.names = latent_names(accel=accel, speed=speed)
+        self.measured = (*(("accel",) if accel else ()), *(("speed",) if speed else ()))
+        self.columns = ("accel_cmd", *self.measured)
+        self.noise_prior: Prior = default_noise_prior(self.names[2:]) if noise_prior is None else noise_prior
+        self.noise, self.share = noise, share
+
+    def likelihood(self, rows: Rows, full: float) -> WindowLikelihood:
+        usable = rows["usable"]
+        count = usable.sum(-1)
+        enough = count >= max(4.0, self.share * full)
+        time = rows["time"].expand(usable.shape)
+        signals = {name: rows[name] if name in self.measured else None for name in ("accel", "speed")}
+        data = LatentWindow(time, rows["accel_cmd"], signals["accel"], signals["speed"], usable)
+        excited = torch.zeros_like(enough)
+        if bool(enough.any()):
+            excited[enough] = latent_excitation(data.select(enough), noise=self.noise)[0]
+        return WindowLikelihood(count, excited, lambda index, prior: LatentDensity(data.select(index), prior))
+
+
+def latent_excitation(
+    data: LatentWindow,
+    *,
+    noise: Mapping[str, float] | None = None,
+    reference: tuple[float, float] = REFERENCE,
+    least_bits: float = LEAST_BITS,
+) -> tuple[Bool[Tensor, " window"], Float[Tensor, " window"]]:
+    """Which windows are excited, ``(window,)`` bool, and their expected information, ``(window,)`` [bit].
+
+    The figure is the expected information about ``(log T_L, log K_L)`` that the *command* brings, at a fixed reference
+    vehicle and noise level: with ``F`` the Fisher information of the predicted signal and ``C = diag(KNOWN²)``,
+    ``log2 det(I + C F) / 2``. It depends on times, commands and mask, on which signals are measured and on ``noise``
+    (names and units of ``NOISE_PRIOR``; the default is ``REFERENCE_NOISE``), not on measured values or a posterior.
+    Each run's start and a constant force on it are taken as unknown, so a constant command carries no information.
+    """
+    place, data = data.time.device, data.to("cpu")  # some short recursions, row by row
+    runs, owner = data.runs()
+    names = latent_names(accel=data.accel is not None, speed=data.speed is not None)
+    values = dict(zip(names[:2], reference, strict=True)) | REFERENCE_NOISE | dict(noise or {})
+    p = {name: torch.full_like(owner, values[name], dtype=torch.float64) for name in names}
+
+    by_lag, by_gain = _sensitivities(runs, *reference)
+
+    def energies_of(signals: list[tuple[Tensor, Tensor]]) -> list[Tensor]:
+        """``sᵀ Σ⁻¹ s`` of signals (acceleration, speed): twice the loss of log likelihood that each causes alone."""
+        count = len(signals)
+        accel, speed = (torch.cat(parts) for parts in zip(*signals, strict=True))
+        time, mask = (x.repeat(count, 1) for x in (runs.time, runs.mask))
+        data = LatentWindow(
+            time,
+            torch.zeros_like(time),
+            None if runs.accel is None else accel,
+            None if runs.speed is None else speed,
+            mask,
+        )
+        repeated = {name: x.repeat(count) for name, x in p.items()}
+        return list((-2.0 * run_log_likelihood(repeated, data, even_steps(data))).chunk(count))
+
+    # A force of unknown constant size, such as a slope: only changes of the command then determine the gain.
+    since = runs.time - runs.time[:, :1]
+    signals = (by_lag, by_gain, (torch.ones_like(since), since))
+    zero = torch.zeros_like(since)
+    pairs = ((0, 1), (0, 2), (1, 2))
+    sums = [(signals[i][0] + signals[j][0], signals[i][1] + signals[j][1]) for i, j in pairs]
+    floor, *found = energies_of([(zero, zero), *signals, *sums])
+    energies = [x - floor for x in found[:3]]
+    tk, tc, kc = (
+        0.5 * (both - energies[i] - energies[j] - floor) for both, (i, j) in zip(found[3:], pairs, strict=True)
+    )
+    tt, kk, cc = energies
+    cc = cc.clamp(min=1e-12)
+    fisher = (tt - tc**2 / cc, kk - kc**2 / cc, tk - tc * kc / cc)
+    tt, kk, tk = (torch.zeros(data.windows, dtype=torch.float64).index_add(0, owner, f) for f in fisher)
+    known_T, known_K = KNOWN
+    determinant = (1.0 + known_T**2 * tt) * (1.0 + known_K**2 * kk) - (known_T * known_K * tk) ** 2
+    bits = 0.5 * determinant.clamp(min=1.0).log() / math.log(2.0)
+    bits = bits.to(place)
+    return bits >= least_bits, bits
+
+
+def _sensitivities(runs: LatentWindow, T: float, K: float) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """Derivatives of (acceleration, speed) by log T_L and by log K_L, each ``(run, time)``, with the command held."""
+    h = 1e-4
+    shape = runs.time.shape
+    lags = (T * (1.0 + h), T * (1.0 - h))
+    found = np.zeros((2, 2, *shape))  # lag, (acceleration, speed), run, row
+    steps, targets = runs.time.diff().clamp(min=0.0).numpy(), K * runs.u.numpy()
+    for i, lag in enumerate(lags):
+        for run in range(shape[0]):
+            # plain numbers: one short recursion after another, in which a call of an array library costs most
+            kept = np.exp(-steps[run] / lag).tolist()
+            a, v = float(targets[run, 0]), 0.0
+            accel, speed = [a], [v]
+            for u, dt, decay in zip(targets[run].tolist(), steps[run].tolist(), kept, strict=False):
+                fading = (a - u) * (1.0 - decay)
+                v += u * dt + lag * fading
+                a -= fading
+                accel.append(a)
+                speed.append(v)
+            found[i, :, run] = accel, speed
+    accel, speed = torch.from_numpy(found).unbind(1)
+    by_lag = ((accel[0] - accel[1]) / (2.0 * h), (speed[0] - speed[1]) / (2.0 * h))
+    # The response is proportional to K_L.
+    return by_lag, (accel.mean(0), speed.mean(0))

@@ -1,8 +1,7 @@
 """The latent log likelihood as a compiled loop over rows (numba), even and uneven alike.
 
-The law is that of :mod:`~avtorch.inference.latent_model`, the recursion that of
-:mod:`~avtorch.inference.latent_filter`, written out for the state ``(v, a, c, e)`` whose two halves move apart: of the
-covariance's ten numbers and the mean's four none is computed that is zero.
+The law and the recursion are those of :mod:`~avtorch.inference.latent_model`, written out for the state ``(v, a, c,
+e)`` whose two halves move apart: of the covariance's ten numbers and the mean's four none is computed that is zero.
 
 Everything compiled of this form stands in this file: numba's cache on disk is renewed when the file changes, and only
 then. Nothing is assumed to be finite; a product may be contracted with the sum that takes it.

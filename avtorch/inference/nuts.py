@@ -99,14 +99,11 @@ def _sites(prior: Prior, names: tuple[str, ...], first: int = 0) -> list[_Site]:
 class PyroModel:
     """One window of a density as a Pyro model: call it to run its statements.
 
-    Args:
-        density: a density with a ``prior`` of `avtorch.inference.priors`.
-        window: which of its windows.
-        samples: ``(a, u, jerk)`` [m/s^2, m/s^2, m/s^3], each ``(time,)``: the rows behind a jerk density, whose
-            likelihood then is an observed statement, Eq. 4 row by row; without them it is a factor.
+    `density`: a density with a ``prior`` of `avtorch.inference.priors`. `window`: which of its windows. `samples`:
+    ``(a, u, jerk)`` [m/s^2, m/s^2, m/s^3], each ``(time,)``: the rows behind a jerk density, whose likelihood then is
+    an observed statement, Eq. 4 row by row; without them it is a factor.
 
-    Raises:
-        InputError: for a window out of range, a prior unknown here, or samples with a density of another form.
+    Raises `InputError` for a window out of range, a prior unknown here, or samples with a density of another form.
     """
 
     def __init__(
@@ -169,11 +166,9 @@ def nuts(
     Chains start from the Laplace approximation at the mode and run one after another. PyTorch's global random state is
     unchanged.
 
-    Args:
-        density, window, samples: see :class:`PyroModel`.
-        statements: let Pyro trace the model's statements at every step; otherwise its sampler is given the same log
-            density as a function, which takes a tenth of the time.
-        warmup: steps of adaptation, dropped.
+    `density`, `window`, `samples`: see :class:`PyroModel`. `statements`: let Pyro trace the model's statements at every
+    step; otherwise its sampler is given the same log density as a function, which takes a tenth of the time. `warmup`:
+    steps of adaptation, dropped.
 
     Returns:
         Draws ``(chain, draw, 1, parameter)``; ``converged`` is false where R-hat exceeds ``rhat_max`` or more than 1 %

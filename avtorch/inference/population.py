@@ -42,18 +42,8 @@ class PopulationMargin:
         car: `(drive,)`, the number of the drive's car, from 0.
         spread: prior mean of the spreads.
 
-    Raises:
-        InputError: for other shapes, numbers that are not finite, an sd or spread of 0, fewer than two cars, or numbers
-            of cars with a gap.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import PopulationMargin, sample
-        >>> lag = torch.tensor([[0.30, 0.32, 0.31, 0.33, 0.60]]).log()
-        >>> margin = PopulationMargin(lag, torch.full_like(lag, 0.02), torch.arange(5))
-        >>> posterior = sample(margin, generator=torch.Generator().manual_seed(0))
-        >>> posterior.names, round(posterior["mean"].mean().exp().item(), 1)  # a typical car's lag
-        (('mean', 'between'), 0.4)
+    Raises `InputError` for other shapes, numbers that are not finite, an sd or spread of 0, fewer than two cars, or
+    numbers of cars with a gap.
     """
 
     def __init__(

@@ -11,8 +11,8 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
+from avtorch.inference.arviz_export import UNITS, shown_unit
 from avtorch.inference.exactness import Exactness
-from avtorch.inference.units import UNITS, shown_unit
 
 if TYPE_CHECKING:
     import pandas
@@ -33,17 +33,6 @@ class Posterior(Displayed):
             Without a comparison (``exactness`` is None, as in the latent form) true means only that the chains agree.
         why: a reason for every window that did not converge, ``""`` for the others; empty where none was recorded.
         exactness: moments of the draws against those of the exact density, or None where they were not compared.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import Posterior
-        >>> g = torch.Generator().manual_seed(0)
-        >>> log_lag = torch.randn(8, 500, 1, 1, dtype=torch.float64, generator=g)  # (chain, draw, window, parameter)
-        >>> posterior = Posterior(("T_L",), (0.1 * log_lag - 1).exp(), converged=torch.tensor([True]))
-        >>> round(posterior.mean.item(), 2), round(posterior.quantile(0.95).item(), 2), posterior.ess_bulk.item() > 1000
-        (0.37, 0.43, True)
-        >>> print(str(posterior.overview()).splitlines()[0])
-        Posterior of T_L: 8 chains of 500 draws, 1 window
     """
 
     names: tuple[str, ...]
@@ -96,8 +85,7 @@ class Posterior(Displayed):
         converged is in the group's ``attrs["converged"]``, as 0 or 1, beside the ``pareto_k`` of each. Needs ``pip
         install 'avtorch[arviz]'``.
 
-        Raises:
-            InputError: for a window that the posterior does not have, and where ArviZ is not installed.
+        Raises `InputError` for a window that the posterior does not have, and where ArviZ is not installed.
         """
         from avtorch.inference.arviz_export import inference_data
 
@@ -188,14 +176,6 @@ def nested_rhat(draws: Float[Tensor, "chain draw *rest"], groups: int = 8) -> Fl
     Many short chains are joined into ``groups`` superchains, cut into halves: the plain R-hat of chains of a few
     autocorrelation times each is large even at stationarity. A common drift shows up between the halves, a chain in
     another place between the groups.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.inference import nested_rhat
-        >>> draws = torch.randn(64, 50, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-        >>> draws[:8, :, 1] += 3.0  # of the second parameter, some chains are elsewhere
-        >>> [round(x, 1) for x in nested_rhat(draws).tolist()]
-        [1.0, 1.5]
     """
     chains, count = draws.shape[:2]
     groups = max(1, min(groups, chains))

@@ -150,9 +150,8 @@ class QuadrantNormal:
 
     The paper (Sec. 3.2.3) does not define the mass below zero; here it is cut off and the rest renormalised.
 
-    Args:
-        mean: shape ``(window, parameter)``, in the parameters' own units.
-        variance: ``lambda``, in the squared units of each parameter.
+    `mean`: shape ``(window, parameter)``, in the parameters' own units. `variance`: ``lambda``, in the squared units of
+    each parameter.
     """
 
     mean: Float[Tensor, "window parameter"]
@@ -211,9 +210,7 @@ class QuadrantNormal:
 class LogSpaceNormal:
     """Normal in ``z`` with full covariance: the whole posterior of a window as the prior of the next.
 
-    Args:
-        mean_z: shape ``(window, parameter)``.
-        cov_z: shape ``(window, parameter, parameter)``.
+    `mean_z`: shape ``(window, parameter)``. `cov_z`: shape ``(window, parameter, parameter)``.
     """
 
     mean_z: Float[Tensor, "window parameter"]

@@ -54,9 +54,7 @@ def sample(
     the step and, up to ``longest``, twice the steps; one that never settles, or for which the comparison is
     inconclusive, is returned with ``converged`` false and the reason in ``why``.
 
-    Args:
-        density: the target.
-        mode: its mode and curvature, if known.
+    `density`: the target. `mode`: its mode and curvature, if known.
 
     Example:
         >>> import torch

@@ -48,8 +48,7 @@ class SamplerSettings:
             (:mod:`avtorch.inference.compiled`), ``"eager"`` always steps with :class:`SGLD`, the reference, and
             ``"compiled"`` is an error where it cannot be had. Both have the same law; a seed gives each its own draws.
 
-    Raises:
-        InputError: naming the setting that is out of range.
+    Raises `InputError` naming the setting that is out of range.
 
     Example:
         >>> from avtorch.inference import SamplerSettings

@@ -56,8 +56,7 @@ class SGLD(Optimizer):
         generator: source of the noise. Its state is part of ``state_dict``, which makes a resumed run equal bit for
             bit.
 
-    Raises:
-        InputError: naming the argument that is out of range.
+    Raises `InputError` naming the argument that is out of range.
 
     Example:
         >>> import torch
@@ -290,8 +289,7 @@ def harmonic(optimizer: Optimizer) -> LambdaLR:
 def polynomial(optimizer: Optimizer, *, b: float = 100.0, gamma: float = 1 / 3) -> LambdaLR:
     """Welling and Teh's ``eta_k = a (b + k)^-gamma``, as ``lr (1 + k/b)^-gamma``: it starts at ``lr = a b^-gamma``.
 
-    Raises:
-        InputError: for ``b <= 0`` or ``gamma`` outside ``(0, 1]``.
+    Raises `InputError` for ``b <= 0`` or ``gamma`` outside ``(0, 1]``.
     """
     if not b > 0:
         raise InputError(f"b: {b} is not positive")

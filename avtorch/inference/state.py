@@ -16,8 +16,7 @@ from avtorch.errors import InputError
 def shaped_as(own: Any, given: Any, place: str) -> None:
     """Check `given` against `own`: the same keys, types, dtypes and shapes, and finite numbers throughout.
 
-    Raises:
-        InputError: that names the `place` within the state.
+    Raises `InputError` that names the `place` within the state.
     """
     if isinstance(own, Tensor):
         if not isinstance(given, Tensor) or given.dtype != own.dtype or given.shape != own.shape:

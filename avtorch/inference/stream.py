@@ -1,11 +1,17 @@
-"""Samples in, one posterior per window out: the online form of the sequential loop, with a bounded memory."""
+"""Samples in, one posterior per window out: the online form of the sequential loop, with a bounded memory.
+
+Its state between two rows has a checksum, and may be kept in a file.
+"""
 
 from __future__ import annotations
 
+import io
+import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,10 +25,81 @@ from avtorch.inference.belief import Belief
 from avtorch.inference.device import Device, checked_device
 from avtorch.inference.estimators.choose import make_estimator
 from avtorch.inference.form import Form, JerkForm
-from avtorch.inference.stream_state import read_state, with_checksum, without_checksum, write_state
 from avtorch.inference.stream_units import StreamUnits
+from avtorch.io import Damaged, fingerprint, read_sealed_bytes, write_sealed
 from avtorch.io.clock import ROUNDING_S, decimals
 from avtorch.io.engagement import settled_rows
+
+SCHEMA = "avtorch.belief_stream/1"
+MOST = 2**30
+"""Maximum size of a state [bytes]."""
+
+_REMEDY = "needs a state as it was saved; begin with a new stream, or load another"
+
+
+def with_checksum(state: Mapping[str, Any]) -> dict[str, Any]:
+    """The state with the fingerprint of its content, under `sha256`."""
+    return {**state, "sha256": fingerprint(state)}
+
+
+def without_checksum(state: Any) -> dict[str, Any]:
+    """The state, once its fingerprint is found right.
+
+    Raises `InputError` for a state that was changed since it was made, or that carries no fingerprint.
+    """
+    if not isinstance(state, dict) or not isinstance(state.get("sha256"), str):
+        raise InputError("state: carries no checksum, as one damaged, or saved by an earlier avtorch; " + _REMEDY)
+    rest = {key: value for key, value in state.items() if key != "sha256"}
+    try:
+        found = fingerprint(rest)
+    except (TypeError, ValueError, RuntimeError, RecursionError):
+        found = None
+    if found != state["sha256"]:
+        raise InputError("state: is damaged or was changed: its checksum is not that of its content; " + _REMEDY)
+    return rest
+
+
+def write_state(path: str | PathLike[str], state: Mapping[str, Any]) -> None:
+    """Write a state so that the file is complete or unchanged.
+
+    Raises `InputError` where the place cannot be written, or is a symlink, a folder or a device.
+    """
+    of = {key: state[key] for key in ("estimator", "form", "window", "vehicles")}
+    write_sealed(Path(path), packed(state), schema=SCHEMA, of=of)
+
+
+def read_state(path: str | PathLike[str]) -> dict[str, Any]:
+    """Read what :func:`write_state` wrote; only tensors and plain values are read, no code is run.
+
+    Raises `InputError` for any file that is not exactly as written.
+    """
+    content = read_sealed_bytes(Path(path), schema=SCHEMA, most=MOST, remedy=_REMEDY).content
+    return unpacked(content, Path(path), _REMEDY)
+
+
+def packed(state: Mapping[str, Any]) -> bytes:
+    """Tensors and plain values as bytes."""
+    content = io.BytesIO()
+    torch.save(dict(state), content)
+    return content.getvalue()
+
+
+def unpacked(content: bytes, path: Path, remedy: str) -> dict[str, Any]:
+    """The inverse of :func:`packed`, for the content of the file at ``path``.
+
+    Raises `Damaged` for anything else; the message ends with ``remedy``.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            # as torch writes it, so that a small file cannot unfold into a large one
+            if any(x.compress_type != zipfile.ZIP_STORED or x.file_size > len(content) for x in archive.infolist()):
+                raise ValueError("compressed")
+        return torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
+    # torch.load has no documented list of errors
+    except Exception as fault:
+        reason = (str(fault).splitlines() or [type(fault).__name__])[0][:100]
+        raise Damaged(f"{path}: holds no tensors and plain values ({reason}); {remedy}") from None
+
 
 _LONGEST_S = 1e6  # up to this distance from the first row, times keep its resolution
 
@@ -31,19 +108,9 @@ _LONGEST_S = 1e6  # up to this distance from the first row, times keep its resol
 class Window(Displayed):
     """One window of every vehicle, and the belief after it.
 
-    Attributes:
-        start_s, end_s: its bounds on the clock of the rows [s]; a row belongs to it if ``start_s <= time < end_s``.
-        n: usable rows, ``(vehicle,)``.
-        belief: see :class:`Belief`; the window was used where ``belief.excited`` and
-            ``belief.converged`` hold.
-
-    Example:
-        >>> from avtorch import BeliefStream, GLVDPlant, Leader, simulate
-        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-        >>> rows = {"accel": run.accel[:, 0], "accel_cmd": run.accel_cmd[:, 0], "jerk": run.jerk[:, 0]}
-        >>> stream = BeliefStream(window=2.0, check_units=False, estimator="map")
-        >>> [(w.start_s, w.end_s, w.n.tolist()) for w in stream.feed(run.time, rows)]  # the third is still open
-        [(0.0, 2.0, [100.0])]
+    `start_s`, `end_s`: its bounds on the clock of the rows [s]; a row belongs to it if ``start_s <= time < end_s``.
+    `n`: usable rows, ``(vehicle,)``. `belief`: see :class:`Belief`; the window was used where ``belief.excited`` and
+    ``belief.converged`` hold.
     """
 
     start_s: float
@@ -76,9 +143,8 @@ class BeliefStream:
         **inference: the estimator's options, for ``"sgld"`` those of
             :class:`~avtorch.inference.sequential.SequentialInference` (``mode``, ``lam``, ``settings``, ``seed`` ...).
 
-    Raises:
-        InputError: for a ``window`` or ``gap`` that is not positive, an unknown estimator, an option it lacks, or a
-            device that this machine lacks.
+    Raises `InputError` for a ``window`` or ``gap`` that is not positive, an unknown estimator, an option it lacks, or a
+    device that this machine lacks.
 
     Example:
         >>> from avtorch import BeliefStream, GLVDPlant, Leader, simulate
@@ -142,11 +208,10 @@ class BeliefStream:
                 of the :data:`~avtorch.io.engagement.SETTLE_S` after it, in which the car's state is not known.
             until: the clock, if it is known to be ahead of the last row: a window that ends by then is closed.
 
-        Raises:
-            InputError: for time that does not increase, a column that is missing or of another shape, a usable row that
-                is not finite, or ``engaged`` other than 0 and 1. The block is then rejected as a whole. Also where the
-                last 10 to 40 s prove that a column has another unit or sign: the belief then also returns to its value
-                before them.
+        Raises `InputError` for time that does not increase, a column that is missing or of another shape, a usable row
+        that is not finite, or ``engaged`` other than 0 and 1. The block is then rejected as a whole. Also where the
+        last 10 to 40 s prove that a column has another unit or sign: the belief then also returns to its value before
+        them.
         """
         time = torch.atleast_1d(torch.as_tensor(time, dtype=torch.float64)).cpu()
         epoch = self._epoch
@@ -200,8 +265,7 @@ class BeliefStream:
     def flush(self) -> list[Window]:
         """Close the open window early, if it has any rows, and start afresh with the next row.
 
-        Raises:
-            InputError: as :meth:`feed` for units and signs.
+        Raises `InputError` as :meth:`feed` for units and signs.
         """
         with self._whole_or_nothing():
             return self._flush()
@@ -337,9 +401,8 @@ class BeliefStream:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`. Where it is refused, the stream is unchanged.
 
-        Raises:
-            InputError: if it was saved by a stream of another window length, form, estimator or number of vehicles, or
-                was changed since, by its checksum.
+        Raises `InputError` if it was saved by a stream of another window length, form, estimator or number of vehicles,
+        or was changed since, by its checksum.
         """
         state = without_checksum(state)
         own = {"estimator": self.estimator, "form": type(self.form).__name__, "window": self.window}
@@ -370,16 +433,14 @@ class BeliefStream:
     def save(self, path: str | PathLike[str]) -> None:
         """Write :meth:`state_dict` to a file, with a checksum, so that the file is complete or unchanged.
 
-        Raises:
-            InputError: where the place cannot be written, or is a symlink, a folder or a device.
+        Raises `InputError` where the place cannot be written, or is a symlink, a folder or a device.
         """
         write_state(path, self.state_dict())
 
     def load(self, path: str | PathLike[str]) -> None:
         """Read what :meth:`save` wrote; only tensors and plain values are read, no code is run.
 
-        Raises:
-            InputError: that names the file, for anything else; the stream is then unchanged.
+        Raises `InputError` that names the file, for anything else; the stream is then unchanged.
         """
         state = read_state(path)
         try:

@@ -19,9 +19,8 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.inference.form import Rows
 from avtorch.inference.jerk import JerkStatistics
-from avtorch.io.consistency import LATER_S, MIN_SPANS, SPANS_S, may_be_late
 from avtorch.io.units import GRAVITY
-from avtorch.io.validity import ACCEL_FACTORS, SAME_MOTION, SPEED_FACTORS
+from avtorch.io.validity import ACCEL_FACTORS, LATER_S, MIN_SPANS, SAME_MOTION, SPANS_S, SPEED_FACTORS, may_be_late
 
 RATES = (("speed", "accel"), ("accel", "jerk"))
 """Pairs of a level and its rate, among the columns of the forms."""
@@ -62,9 +61,7 @@ class Pair(NamedTuple):
 class StreamUnits:
     """The present stretch of a stream, and the belief before it.
 
-    Args:
-        columns: those of the form.
-        vehicles: how many.
+    `columns`: those of the form. `vehicles`: how many.
     """
 
     def __init__(self, columns: tuple[str, ...], vehicles: int) -> None:
@@ -86,8 +83,7 @@ class StreamUnits:
     def take(self, rows: Rows, belief: dict[str, Any]) -> None:
         """Take in a window of rows that ``belief`` does not include yet.
 
-        Raises:
-            InputError: that names columns and vehicle, where the stretch proves a unit or sign wrong.
+        Raises `InputError` that names columns and vehicle, where the stretch proves a unit or sign wrong.
         """
         if not self.pairs or not len(rows["time"]):
             return
@@ -221,8 +217,7 @@ class StreamUnits:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from :meth:`state_dict`.
 
-        Raises:
-            InputError: for what is no stretch's state.
+        Raises `InputError` for what is no stretch's state.
         """
         if not isinstance(state, dict) or set(state) != {"rows", "sums", "looks", "before"}:
             raise InputError("state: units: not what a stream saves")

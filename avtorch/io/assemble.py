@@ -16,8 +16,7 @@ from avtorch.io.clock import clock_words, gap_limit, median_step, since, since_s
 from avtorch.io.mapping import PEDALS, SIGNALS, SignalMap
 from avtorch.io.merge import Arrivals, held
 from avtorch.io.tables import Table, read_table
-from avtorch.io.unit_names import stated_unit
-from avtorch.io.units import to_si
+from avtorch.io.units import stated_unit, to_si
 from avtorch.io.validity import MOST_BAD, BadRows, check_range, check_rate, check_time, disordered, off_clock, stray
 
 _NAME = 40  # characters of the longest column name that may be a signal's, mistyped

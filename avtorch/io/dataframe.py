@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from avtorch.errors import InputError, printable, quoted
-from avtorch.io.arrow_cells import cells_of, is_text, scalar_checks
+from avtorch.io.formats.parquet import cells_of, is_text, scalar_checks
 from avtorch.io.tables import Table, with_whole_stamps
 
 _INDEX = "__index_level_0__"  # pandas' own name for an index without one
@@ -43,12 +43,6 @@ def frame_table(frame: DataFrame, source: str = "DataFrame") -> Table:
     is none. Times become seconds since their epoch. Columns that hold neither numbers nor texts are not read.
 
     Raises InputError where the frame cannot be turned into Arrow columns.
-
-    Example:
-        >>> import pyarrow as pa
-        >>> from avtorch.io.dataframe import frame_table
-        >>> frame_table(pa.table({"time": [0.0, 0.1], "accel_cmd": [0.5, 0.6]})).names
-        ('time', 'accel_cmd')
     """
     import pyarrow as pa
 

@@ -1,4 +1,4 @@
-"""Recorded leaders and their forms: OpenACC, NGSIM, I-24, and plain tables, recognised by their header."""
+"""Recorded leaders, and followers behind them (OpenACC, NGSIM, I-24, plain tables), recognised by their header."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 import os
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError, listed, printable
-from avtorch.io.consistency import scale_between
+from avtorch.io.log import Log
 from avtorch.io.mapping import Pairs, pairs
 from avtorch.io.opening import place
 from avtorch.io.tables import Table, read_bytes, read_table
-from avtorch.io.text.encoding import decoded
+from avtorch.io.text import decoded
 from avtorch.io.units import to_si
-from avtorch.io.validity import check_range, check_time
+from avtorch.io.validity import check_range, check_time, scale_between
 
 LONG_STEP_S = 1.5
 """A recording with a longer step between rows is cut there: the drive cycles come at 1 Hz, everything else at 10 Hz."""
@@ -70,7 +70,7 @@ def checked_leader(
         if values is not None:
             filled = np.where(np.isnan(values), 0.0, values)
             check_range(signal, filled, lambda row, c=columns[signal]: table.where(row, c))
-    whole = _longest(known, np.diff(time) <= LONG_STEP_S)
+    whole = _longest(known[1:] & known[:-1] & (np.diff(time) <= LONG_STEP_S))
     if whole is None:
         raise InputError(f"{table.source}: column {columns['speed']!r}: no two rows in a row hold a speed")
     if whole.stop - whole.start < len(time):
@@ -92,9 +92,8 @@ def checked_leader(
     return RawLeader(time[whole], np.maximum(speed, 0.0), accel, spacing, name, "; ".join(notes))
 
 
-def _longest(known: BoolArray, near: BoolArray) -> slice | None:
-    """The longest run of rows that are known and near to each other, at least two."""
-    linked = known[1:] & known[:-1] & near
+def _longest(linked: BoolArray) -> slice | None:
+    """The longest run of rows each ``linked`` to the next, at least two."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], linked, [False]]).astype(int)))
     if len(edges) == 0:
         return None
@@ -135,47 +134,39 @@ def numbered(stem: str, names: Iterable[str]) -> list[int]:
     return sorted(int(match[1]) for match in found if match)
 
 
-def astazero(table: Table, vehicle: int | None = None) -> RawLeader:
-    """A vehicle of the AstaZero form: ``Time, X_i, SpeedDoppler_i, Accel_i, Spacing_i`` (to the vehicle ahead)."""
-    number = _choose(table, "SpeedDoppler", vehicle)
-    columns = {"time": "Time", "speed": f"SpeedDoppler{number}"}
-    accel = spacing = None
-    if f"Accel{number}" in table.names:
-        columns["accel"] = f"Accel{number}"
-        accel = table.numbers(columns["accel"], empty_is_nan=True)
-    if f"Spacing{number}" in table.names:
-        spacing = table.numbers(f"Spacing{number}", empty_is_nan=True)
-    return checked_leader(
-        table,
-        table.numbers("Time"),
-        table.numbers(columns["speed"], empty_is_nan=True),
-        accel,
-        spacing,
-        columns=columns,
-        name=f"{Path(table.source).stem}, vehicle {number}",
-    )
+def _stem(names: Iterable[str]) -> str:
+    """What a vehicle's speed is called before its number in a file of OpenACC; empty in any other.
 
-
-def zalazone(table: Table, vehicle: int | None = None, order: tuple[str, ...] = ()) -> RawLeader:
-    """A vehicle of the ZalaZONE form: header lines, then ``Time, Speed_i, E_i, N_i, Alt_i, IVS_i``.
-
-    Vehicle numbers can skip and cells can be empty. ``IVS_i`` is the spacing between vehicles i and i + 1, so a
-    vehicle's spacing to the one ahead bears the number before its own. ``order``: the makes, by number, from the file's
-    header.
+    The AstaZero form is ``Time, X_i, SpeedDoppler_i, Accel_i, Spacing_i`` (to the vehicle ahead), the ZalaZONE one,
+    after its header lines, ``Time, Speed_i, E_i, N_i, Alt_i, IVS_i``: the spacing between vehicles i and i + 1.
     """
-    number = _choose(table, "Speed", vehicle)
-    speed = f"Speed{number}"
-    ahead = f"IVS{number - 1}"
-    make = order[number - 1] if 0 < number <= len(order) else ""
-    return checked_leader(
-        table,
-        table.numbers("Time"),
-        table.numbers(speed, empty_is_nan=True),
-        None,
-        table.numbers(ahead, empty_is_nan=True) if ahead in table.names else None,
-        columns={"time": "Time", "speed": speed},
-        name=f"{Path(table.source).stem}, vehicle {number}" + (f" ({make})" if make else ""),
-    )
+    names = set(names)
+    if any(name.startswith("SpeedDoppler") for name in names):
+        return "SpeedDoppler"
+    return "Speed" if "Time" in names and numbered("Speed", names) else ""
+
+
+def _spacing(stem: str, number: int) -> str:
+    return f"Spacing{number}" if stem == "SpeedDoppler" else f"IVS{number - 1}"
+
+
+def _vehicle(table: Table, number: int, order: tuple[str, ...]) -> str:
+    make = f" ({order[number - 1]})" if 0 < number <= len(order) else ""
+    return f"{Path(table.source).stem}, vehicle {number}{make}"
+
+
+def openacc(table: Table, vehicle: int | None = None, order: tuple[str, ...] = ()) -> RawLeader:
+    """A vehicle of OpenACC; numbers can skip and cells can be empty. ``order``: the makes, by number."""
+    stem = _stem(table.names)
+    number = _choose(table, stem, vehicle)
+    columns = {"time": "Time", "speed": f"{stem}{number}"}
+    if stem == "SpeedDoppler" and f"Accel{number}" in table.names:
+        columns["accel"] = f"Accel{number}"
+    time, speed = table.numbers("Time"), table.numbers(columns["speed"], empty_is_nan=True)
+    accel = table.numbers(columns["accel"], empty_is_nan=True) if "accel" in columns else None
+    ahead = _spacing(stem, number)
+    spacing = table.numbers(ahead, empty_is_nan=True) if ahead in table.names else None
+    return checked_leader(table, time, speed, accel, spacing, columns=columns, name=_vehicle(table, number, order))
 
 
 def vehicle_order(path: Path) -> tuple[str, ...]:
@@ -335,16 +326,15 @@ def read_leader(
     """
     table = read_table(path, header="Time", wanted=recorded)
     names = set(table.names)
-    form, read = "plain", None
-    if "SpeedDoppler1" in names or any(n.startswith("SpeedDoppler") for n in names):
-        form, read = "OpenACC", astazero
-    elif "Time" in names and numbered("Speed", table.names):
-        form, read = "OpenACC", lambda t, v: zalazone(t, v, vehicle_order(Path(path)))
+    if stem := _stem(names):
+        form = "OpenACC"
     elif {"event", "time", "lead_speed"} <= names:
         form = "NGSIM"
     elif {"Time", "Velocity"} <= names:
         form = "I-24"
-    elif not {"speed", "lead_speed"} & names or "time" not in names:
+    elif {"speed", "lead_speed"} & names and "time" in names:
+        form = "plain"
+    else:
         raise InputError(
             f"{table.source}: is no leader file; it needs columns time and speed, or the form of OpenACC, NGSIM or "
             f"I-24; columns: {listed(table.names)}"
@@ -352,8 +342,8 @@ def read_leader(
     _refuse_idle(table.source, form, vehicle=vehicle, event=event, duration=duration, unit=unit)
     if not table.rows:
         raise InputError(f"{table.source}: found a header but no rows; needs a recording")
-    if read is not None:
-        return read(table, vehicle)
+    if stem:
+        return openacc(table, vehicle, vehicle_order(Path(path)) if stem == "Speed" else ())
     if form == "NGSIM":
         return read_event(table, event) if event is not None else join_events(table, duration=duration)
     return _i24(table) if form == "I-24" else _plain(table, unit)
@@ -391,3 +381,126 @@ _NUMBERED = re.compile(r"(SpeedDoppler|Accel|Spacing|Speed|IVS)[0-9]{1,6}")  # O
 def recorded(names: Iterable[str]) -> set[str]:
     """Those of a file's columns that a known form has."""
     return {name for name in names if name in _PLAIN or _NUMBERED.fullmatch(name)}
+
+
+_FOLLOWING_STEP_S = 0.25
+_DRIFT_M, _DRIFT_MPS = 5.0, 0.15  # allowed difference of spacing and integrated speeds over a stretch
+_JUMP_M = 2.0  # a larger jump of the gap from row to row, beyond what both speeds imply, means another leader
+
+
+def read_following(
+    path: str | os.PathLike[str],
+    *,
+    vehicle: int | None = None,
+    event: int | None = None,
+    map: Pairs = None,
+    unit: Pairs = None,
+    stamp: Pairs = None,
+) -> Log:
+    """A follower out of OpenACC (AstaZero or ZalaZONE form; ``vehicle``, default: the first that follows one), I-24 or
+    NGSIM (``event``, default: the longest), or any log with ``speed``, ``spacing`` and ``lead_speed``.
+
+    Recordings are cut to the longest stretch in which all three are known and the leader stays the same; ``remarks``
+    records the cut. ``map``, ``unit``, ``stamp``: of a log, as for ``Log.read``; a recording's form fixes its own.
+    Raises InputError for a vehicle or event that is not there or follows nobody, for a spacing that contradicts the
+    speeds, for an option that does not apply, and as ``Log.read`` does.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.io import Log, read_following
+        >>> time = np.arange(0.0, 20.0, 0.1)
+        >>> columns = dict(speed=20 - np.cos(time), lead_speed=20 + np.sin(time), spacing=np.full(200, 25.0))
+        >>> Log.from_arrays(time=time, **columns, following=True).write("following.csv")
+        >>> log = read_following("following.csv")
+        >>> log.accel_cmd is None, log.rows
+        (True, 200)
+    """
+    table = read_table(path, header="Time", wanted=recorded)
+    names = set(table.names)
+    columns: dict[str, object] = {"map": map or None, "unit": unit or None, "stamp": stamp or None}
+    if stem := _stem(names):
+        _idle(table.source, event=event, **columns)
+        numbers = numbered(stem, names)
+        own = _follower(table.source, vehicle, [n for n in numbers if n - 1 in numbers and _spacing(stem, n) in names])
+        three = (table.numbers(c, empty_is_nan=True) for c in (f"{stem}{own}", _spacing(stem, own), f"{stem}{own - 1}"))
+        makes = vehicle_order(Path(path)) if stem == "Speed" else ()
+        return _whole(_vehicle(table, own, makes), table.numbers("Time"), *three)
+    if {"Time", "Velocity", "SpaceGap", "RelativeVelocity"} <= names:
+        _idle(table.source, vehicle=vehicle, event=event, **columns)
+        return _instrumented(table)
+    if {"event", "time", "spacing", "speed", "lead_speed"} <= names:
+        _idle(table.source, vehicle=vehicle, **columns)
+        return _following_event(table, event)
+    _idle(table.source, vehicle=vehicle, event=event)
+    return Log.read(path, map=map, unit=unit, stamp=stamp, following=True)
+
+
+def _idle(source: str, **given: object) -> None:
+    for option, value in given.items():
+        if value is not None:
+            argument = f"{option} {value}" if isinstance(value, int) else option
+            raise InputError(f"{source}: {argument} has no meaning for a file of this form")
+
+
+def _follower(source: str, vehicle: int | None, followers: list[int]) -> int:
+    if not followers:
+        raise InputError(f"{source}: no vehicle has a spacing to one ahead whose speed is there")
+    if vehicle is None:
+        return followers[0]
+    if vehicle not in followers:
+        known = listed(map(str, followers))
+        raise InputError(f"{source}: vehicle {vehicle} follows nobody in it; followers: {known}")
+    return vehicle
+
+
+def _instrumented(table: Table) -> Log:
+    speed = table.numbers("Velocity", empty_is_nan=True) / 3.6
+    gap = table.numbers("SpaceGap", empty_is_nan=True)
+    lead = speed + table.numbers("RelativeVelocity", empty_is_nan=True)
+    gap = np.where(gap >= NO_LEADER_M, np.nan, gap)
+    return _whole(Path(table.source).stem, table.numbers("Time"), speed, gap, lead)
+
+
+def _following_event(table: Table, event: int | None) -> Log:
+    numbers = table.numbers("event")
+    ids, counts = np.unique(numbers, return_counts=True)
+    own = int(ids[np.argmax(counts)]) if event is None else event
+    rows = numbers == own
+    if not rows.any():
+        raise InputError(f"{table.source}: event {own} is not in it; events {ids[0]:.0f} to {ids[-1]:.0f} are")
+    time, speed, spacing, lead = (table.numbers(n)[rows] for n in ("time", "speed", "spacing", "lead_speed"))
+    return _whole(f"NGSIM {own}", time, speed, spacing, lead)
+
+
+def _whole(name: str, time: FloatArray, speed: FloatArray, spacing: FloatArray, lead: FloatArray) -> Log:
+    """The longest stretch in which everything is known, as a log."""
+    known = np.isfinite(speed) & np.isfinite(lead) & np.isfinite(spacing) & (np.nan_to_num(spacing) > 0)
+    steps = np.diff(time)
+    linked = known[1:] & known[:-1] & (steps <= _FOLLOWING_STEP_S) & (steps > 0)
+    with np.errstate(invalid="ignore"):
+        jumped = np.abs(np.diff(spacing) - steps * (lead - speed)[:-1]) > _JUMP_M
+    linked &= ~jumped
+    part = _longest(linked)
+    if part is None:
+        raise InputError(f"{name}: no two rows in a row hold speed, spacing and the leader's speed")
+    opened = float(spacing[part][-1] - spacing[part][0])
+    implied = float(np.sum(np.diff(time[part]) * (lead - speed)[part][:-1]))
+    if abs(opened - implied) > _DRIFT_M + _DRIFT_MPS * float(time[part][-1] - time[part][0]):
+        raise InputError(
+            f"{name}: the spacing grew by {opened:.0f} m where the speeds imply {implied:.0f} m; "
+            "needs spacing and speeds of one and the same leader"
+        )
+    log = Log.from_arrays(
+        name=name,
+        time=time[part],
+        speed=np.maximum(speed[part], 0.0),
+        spacing=spacing[part],
+        lead_speed=np.maximum(lead[part], 0.0),
+        following=True,
+    )
+    if part.stop - part.start == len(time):
+        return log
+    remark = (
+        f"the longest stretch behind one leader with all known, rows {part.start + 1} to {part.stop} of {len(time)}"
+    )
+    return replace(log, remarks=(remark,))

@@ -1,9 +1,10 @@
-"""The drive log: one row per sample, SI units, checked when it is made."""
+"""The drive log: one row per sample, SI units, checked when it is made; and what a user may give for one."""
 
 from __future__ import annotations
 
 import io
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -16,10 +17,10 @@ from numpy.typing import NDArray
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError, quoted
+from avtorch.io.answers import atomic
 from avtorch.io.assemble import assemble
-from avtorch.io.atomic import atomic
 from avtorch.io.clock import median_step, since_start, stretches
-from avtorch.io.dataframe import DataFrame, frame_table
+from avtorch.io.dataframe import DataFrame, frame_table, is_dataframe
 from avtorch.io.engagement import settled_rows
 from avtorch.io.formats import is_recording, open_recording
 from avtorch.io.mapping import PEDALS, SIGNALS, Pairs, SignalMap, given_mapping, pairs, read_mapping
@@ -326,3 +327,55 @@ class Log(Displayed):
         """The rows of a slice, as a log that keeps its segment numbers."""
         cut = {f.name: getattr(self, f.name) for f in fields(self)}
         return replace(self, **{k: v[part] for k, v in cut.items() if isinstance(v, np.ndarray)})
+
+
+LogSource = Log | str | os.PathLike[str] | DataFrame
+"""A log, a path to one, or a data frame with its columns."""
+
+
+def as_log(
+    given: LogSource, *, map: Pairs = None, unit: Pairs = None, following: bool = False, argument: str = "log"
+) -> Log:
+    """The log that `given` is, or that is read from it; `map` and `unit` as in `Log.read`, for what is read here.
+
+    `argument`: its name in messages. Raises `InputError` for anything else, and for what `Log.read` and
+    `Log.from_dataframe` refuse.
+    """
+    if isinstance(given, Log):
+        for name, pairs in (("map", map), ("unit", unit)):
+            if pairs:
+                raise InputError(f"{name}: found beside a Log, which has been read; give it to Log.read or from_arrays")
+        return given
+    if isinstance(given, (str, os.PathLike)):
+        return Log.read(given, map=map, unit=unit, following=following)
+    if is_dataframe(given):
+        return Log.from_dataframe(given, map=map, unit=unit, following=following)
+    kind = type(given).__name__
+    hint = "; columns by name make one with Log.from_arrays(**columns)" if isinstance(given, dict) else ""
+    if isinstance(given, (list, tuple)):
+        hint = "; one log at a time"
+    raise InputError(f"{argument}: found a {kind}, needs a Log, a path or a DataFrame{hint}")
+
+
+def as_logs(
+    given: LogSource | Sequence[LogSource], *, map: Pairs = None, unit: Pairs = None, argument: str = "logs"
+) -> list[Log]:
+    """One log or several, each as `as_log` takes it, all with the same `map` and `unit`."""
+    if isinstance(given, (Log, str, os.PathLike)) or is_dataframe(given):
+        return [as_log(given, map=map, unit=unit, argument=argument)]  # pyright: ignore[reportArgumentType]
+    if isinstance(given, dict) or not hasattr(given, "__iter__"):
+        return [as_log(given, map=map, unit=unit, argument=argument)]  # pyright: ignore[reportArgumentType]
+    # a log that has been read has its names and units; the others take those given
+    return [
+        as_log(one, argument=argument) if isinstance(one, Log) else as_log(one, map=map, unit=unit, argument=argument)
+        for one in given  # pyright: ignore[reportGeneralTypeIssues]
+    ]
+
+
+def no_command(log: Log, need: str) -> InputError:
+    """The error; `need`: what needs the command, such as ``which the diagnosis needs``."""
+    words = f"{log.name}: has no accel_cmd{need}"
+    others = log.pedals or (("speed_cmd",) if log.speed_cmd is not None else ())
+    if others:
+        words += f"; avtorch.pedals.fit_pedals makes one of its {' and '.join(others)}"
+    return InputError(words)

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from avtorch.errors import InputError, printable, quoted
-from avtorch.io.opening import place
-from avtorch.io.toml import read_toml
+from avtorch.io.opening import place, read_toml
 from avtorch.io.units import to_si
 from avtorch.numeral import numeral
 

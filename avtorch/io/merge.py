@@ -11,7 +11,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.io.recording import Channel, Recording
+from avtorch.io.formats.listed import Channel, Recording
 from avtorch.io.tables import Table
 from avtorch.io.validity import RATE_HZ
 

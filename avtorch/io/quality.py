@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from avtorch.errors import InputError, listed
 from avtorch.io.clock import clock_words, median_step, stretches
-from avtorch.io.consistency import line_between, scale_between
 from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import Log
 from avtorch.io.mapping import PEDALS
-from avtorch.io.validity import DELAYS_S, command_scale
+from avtorch.io.validity import DELAYS_S, command_scale, line_between, scale_between
 
 LEAST_S = 2.0
 """The shortest stretch [s] of which anything is estimated: the lag and dead time of a car, and as long again."""

@@ -18,12 +18,10 @@ from numpy.typing import NDArray
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
-from avtorch.io.arrow_cells import cells_of as arrow_cells
 from avtorch.io.formats.apart import parquet_apart
+from avtorch.io.formats.parquet import cells_of as arrow_cells
 from avtorch.io.opening import MOST_BYTES, MOST_CELLS, MOST_COLUMNS, beginning, place, read_regular
-from avtorch.io.text.encoding import decoded, unzipped
-from avtorch.io.text.layout import Layout, cells_of, layout_of, rows_of
-from avtorch.io.text.time_stamps import is_time, seconds_of
+from avtorch.io.text import Layout, cells_of, decoded, is_time, layout_of, rows_of, seconds_of, unzipped
 from avtorch.numeral import numeral
 
 _NEED = "a CSV or Parquet file"
@@ -187,7 +185,7 @@ def read_table(path: str | os.PathLike[str], *, header: str | None = None, wante
     """Read a table of text or a Parquet file, of the columns only those that are `wanted` (default: all).
 
     Text is UTF-8, UTF-16 or Windows-1252, may be gzipped, and has its separator, decimal mark, comments and row of
-    units found (`avtorch.io.text.layout`). ``header`` names the first cell of the header line where other lines come
+    units found (`avtorch.io.text`). ``header`` names the first cell of the header line where other lines come
     before it that look like one. Unnamed columns get the name ``(unnamed 1)`` by position. Lines end at ``\\n``,
     ``\\r\\n`` or ``\\r`` and nowhere else; empty ones are skipped. A row with too few or too many cells is a fault of
     the table. Raises InputError for any other file: missing, not a regular file, empty, binary, no header, and beyond

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import torch
 
 from avtorch.inference.form import Form
-from avtorch.live.car import LiveCar, LiveWindow
-from avtorch.live.settings import LiveSettings
+from avtorch.live.car import LiveCar, LiveSettings, LiveWindow
 from avtorch.live.source import Batch, Counts, Row
 from avtorch.results import window_entry
 

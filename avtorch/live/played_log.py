@@ -11,9 +11,9 @@ import numpy as np
 
 from avtorch.errors import InputError
 from avtorch.io import Log
-from avtorch.io.fingerprint import fingerprint
+from avtorch.io.log import no_command
 from avtorch.io.mapping import Pairs
-from avtorch.io.no_command import no_command
+from avtorch.io.sealed import fingerprint
 from avtorch.live.source import SIGNALS, Batch, Row, Stop
 
 ROWS = 500

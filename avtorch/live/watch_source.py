@@ -1,7 +1,14 @@
-"""The loop of a live watch: pull a batch, answer, write lines of JSON to sinks, keep."""
+"""The loop of a live watch: pull a batch, answer, write lines of JSON to sinks, keep the cars' states in a folder.
+
+Each car has a file of its own: its belief with draws and random numbers, its open window, the rows kept back for
+re-ordering, and the position in the source up to which its rows are in it. Files are written one after the other
+between batches, so that no answer waits for all of them. A record beside them holds the position from which the source
+has to be read: rows that a car has taken in already are passed over. Each file appears whole or not at all.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import sys
@@ -12,11 +19,129 @@ from pathlib import Path
 from typing import IO, Any, Protocol
 
 from avtorch.errors import InputError
+from avtorch.inference.stream import packed, unpacked
+from avtorch.io import read_sealed, read_sealed_bytes, write_sealed
 from avtorch.io.answers import json_text
 from avtorch.live.car import LiveCar
-from avtorch.live.kept_cars import KeptCars
 from avtorch.live.live_watch import Answer, LiveWatch
 from avtorch.live.source import Source, Stop
+from avtorch.version import __version__
+
+CAR, RECORD = "avtorch.live_car/1", "avtorch.live_source/1"
+MOST = 2**28
+"""Bytes of a car's state at most; it takes some 0.1 MB."""
+EVERY_S = 10.0
+"""Wall-clock time after which a car's new state is written [s]: what is computed again at most after a kill."""
+REMEDY = "use the same settings, or another folder for --state"
+
+
+class KeptCars:
+    """The states in `folder`, of a watch of the source called `identity`.
+
+    Raises `InputError` where the folder cannot be used.
+    """
+
+    def __init__(self, folder: str | Path, identity: str | None = None) -> None:
+        self.folder, self.identity = Path(folder), identity
+        self._written: dict[str, float] = {}  # by car, when
+        self._at: dict[str, int | None] = {}  # by car, the position that its file holds
+        self._begun: int | None = None
+        self._recorded = time.monotonic()
+        self._next = 0.0
+
+    @property
+    def same_source(self) -> bool:
+        """Whether the folder holds states of this very source, which can be read on from where they end."""
+        record = self.folder / "source.json"
+        if self.identity is None or not record.exists():
+            return False
+        return read_sealed(record, schema=RECORD, remedy=REMEDY).content.get("source") == self.identity
+
+    def restore(self, watch: LiveWatch) -> int | None:
+        """Bring `watch` to the state in the folder; returns the position to read the source from, None for its start.
+
+        Raises `InputError` for states of other settings, and for damaged ones.
+        """
+        record = self.folder / "source.json"
+        if not record.exists():
+            return None
+        found = read_sealed(record, schema=RECORD, remedy=REMEDY)
+        self._same(found.of, watch, record)
+        content = found.content
+        watch.counts.load(content.get("counts", {}))
+        for path in sorted(self.folder.glob("*.car")):
+            sealed = read_sealed_bytes(path, schema=CAR, most=MOST, remedy=REMEDY)
+            self._same(sealed.of, watch, path)
+            try:
+                car = LiveCar.restored(unpacked(sealed.content, path, REMEDY), watch.settings, watch.counts)
+            except InputError as fault:
+                raise InputError(f"{path}: {fault}; {REMEDY}") from None
+            watch.cars[car.name] = car
+        same = self.same_source
+        position = content.get("position") if same else None
+        for car in watch.cars.values():
+            car.position = car.position if same else None
+            self._at[car.name] = car.position
+        self._begun = position if type(position) is int else None
+        return self._begun
+
+    def begin(self, watch: LiveWatch) -> None:
+        """Name the source in the folder, so that a run killed before its first state is known to be of it, too."""
+        if not (self.folder / "source.json").exists():
+            self._record(watch, None)
+
+    def begin_anew(self, watch: LiveWatch, identity: str | None) -> None:
+        """Positions count from 0 again, in a source of another identity; all states are written."""
+        self.identity, self._begun = identity, None
+        self.write(watch)
+
+    def keep(self, watch: LiveWatch, position: int | None) -> None:
+        """Write the state of one car whose turn it is, if any, and the record now and then."""
+        now = time.monotonic()
+        if now < self._next:
+            return
+        self._next = now + EVERY_S / max(200, 2 * len(watch.cars))  # so that each has its turn
+        for car in watch.cars.values():
+            if car.name not in self._written:
+                self._written[car.name] = now
+                self._at.setdefault(car.name, self._begun)
+        due = min(self._written, key=self._written.__getitem__, default=None)
+        if due is not None and now - self._written[due] >= EVERY_S:
+            self._write_car(watch, watch.cars[due])
+        if now - self._recorded >= EVERY_S:
+            self._recorded = now
+            safe = [self._at[car.name] for car in watch.cars.values() if car.position != self._at[car.name]]
+            known = [x for x in safe if x is not None]
+            self._record(watch, position if not safe else min(known) if len(known) == len(safe) else self._begun)
+
+    def write(self, watch: LiveWatch, position: int | None = None) -> None:
+        """Write all states and the record, at the end."""
+        for car in watch.cars.values():
+            self._write_car(watch, car)
+        self._record(watch, position)
+
+    def _write_car(self, watch: LiveWatch, car: LiveCar) -> None:
+        name = hashlib.sha256(car.name.encode("utf-8", "surrogatepass")).hexdigest()[:24]
+        path = self.folder / f"{name}.car"
+        write_sealed(path, packed(car.state_dict()), schema=CAR, of=_work(watch))
+        self._written[car.name], self._at[car.name] = time.monotonic(), car.position
+
+    def _record(self, watch: LiveWatch, position: int | None) -> None:
+        content = {"source": self.identity, "position": position, "counts": watch.counts.to_dict()}
+        write_sealed(self.folder / "source.json", content, schema=RECORD, of=_work(watch))
+
+    @staticmethod
+    def _same(of: dict[str, Any], watch: LiveWatch, path: Path) -> None:
+        """Raises `InputError` that names the setting in which a state differs from the watch."""
+        own = _work(watch)
+        for name, value in {**own["settings"], "avtorch": own["avtorch"]}.items():
+            found = of.get("avtorch") if name == "avtorch" else of.get("settings", {}).get(name)
+            if found != value:
+                raise InputError(f"{path}: was begun with {name} {str(found)[:40]}, not {value}; {REMEDY}")
+
+
+def _work(watch: LiveWatch) -> dict[str, Any]:
+    return {"avtorch": __version__, "settings": watch.settings.to_dict()}
 
 
 class Sink(Protocol):

@@ -10,16 +10,15 @@ from typing import Any
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.io.dataframe import DataFrame, frame_table, is_dataframe
-from avtorch.io.following import read_following
 from avtorch.io.formats import is_recording, open_recording
-from avtorch.io.log import Log
+from avtorch.io.leaders import read_following
+from avtorch.io.log import Log, LogSource, as_log
 from avtorch.io.mapping import Pairs, mapping_beside
 from avtorch.io.opening import place
 from avtorch.io.quality import Quality, require_usable
 from avtorch.io.quality import check as check_quality
-from avtorch.io.source import LogSource, as_log
 from avtorch.io.tables import read_table
-from avtorch.logcheck.candidates import table_of
+from avtorch.logcheck.assignment import table_of
 from avtorch.logcheck.proposal import Proposal, propose
 from avtorch.logcheck.recorder import duration_note, excitation_notes, recorder_notes
 

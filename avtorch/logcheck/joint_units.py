@@ -15,8 +15,8 @@ from itertools import product
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.io.consistency import Scale, late_response, scale_between
 from avtorch.io.units import to_si
+from avtorch.io.validity import Scale, late_response, scale_between
 
 # natural logarithms of how much rarer a unit is than SI in logs of cars
 _SPEED = {"m/s": 0.0, "km/h": 0.5, "mph": 1.0, "kn": 4.0, "ft/s": 4.0, "cm/s": 4.0, "mm/s": 5.0}

@@ -52,11 +52,6 @@ class LateChannel:
         seconds: the delay or the filter's time constant [s].
         sd: its standard error, by a jackknife over blocks of the drive [s].
         explained: share of the late channel's variance that commands explain so, by way of the other one.
-
-    Example:
-        >>> from avtorch.logcheck.late_channel import LateChannel
-        >>> print(LateChannel("accel", "delay", 0.1, 0.004, 0.97))
-        accel comes 0.10 s (SE 0.004) after the slope of speed
     """
 
     name: Literal["accel", "speed"]
@@ -115,16 +110,6 @@ class _Tried(NamedTuple):
 def late_channel(log: Log) -> LateChannel | None:
     """The channel of `accel` and `speed` that is clearly late (`CLEAR`), by half of a row at least; None where neither
     is, the log lacks one or commands, or commands explain so little that their order means nothing (`AGREE`).
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch import Log
-        >>> from avtorch.logcheck.late_channel import late_channel
-        >>> time, drawn = np.arange(0.0, 90.0, 0.05), np.random.default_rng(0)
-        >>> accel = np.repeat(drawn.normal(size=60), 30)
-        >>> speed = 20.0 + np.concatenate([[0.0], np.cumsum(0.05 * accel[:-1])])
-        >>> late_channel(Log.from_arrays(time=time, accel_cmd=accel, accel=np.roll(accel, 4), speed=speed)).name
-        'accel'
     """
     if log.accel is None or log.speed is None or log.accel_cmd is None:
         return None

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.decision.record import SupervisedRun
 from avtorch.decision.supervisor import Supervisor
+from avtorch.decision.watch import SupervisedRun
 from avtorch.paper.drive import CHANGE_S, CHANGED, HEALTHY, NOISE, Progress, change, noise_seeds
 from avtorch.paper.leaders import DRIVE_S, Ahead, Leaders
 from avtorch.paper.rows import ClaimRow, error, median_interval, middle, share, spread

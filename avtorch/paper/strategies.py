@@ -20,10 +20,10 @@ from torch import Tensor
 
 from avtorch.decision.algorithm2 import PAPER_GAINS, PAPER_TIME_GAP
 from avtorch.decision.grid import Grid
-from avtorch.decision.record import SupervisedRun
 from avtorch.decision.settings import Setting
 from avtorch.decision.strategist import Strategist
 from avtorch.decision.supervisor import ALLOWED, Supervisor
+from avtorch.decision.watch import SupervisedRun
 from avtorch.paper.drive import (
     ACT_S,
     CHANGE_S,

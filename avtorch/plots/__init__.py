@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     )
     from avtorch.plots.posterior_figures import VALIDATION_PICTURES, validation_figures
     from avtorch.plots.posteriors import agreement_scatter, exact_density, joint_cloud, marginals
-    from avtorch.plots.ranks import ecdf_difference, ecdf_of, pooled_rank_counts, rank_band, rank_plot
     from avtorch.plots.ratios import ratio_figure, ratio_whiskers
     from avtorch.plots.signatures import effect_signature, signature_figure
     from avtorch.plots.style import STYLE, save, show
@@ -54,7 +53,6 @@ _HOME = {
     "plane": "gain_curve region region_figure setting_region stability_figure verdict_legend verdict_map",
     "posterior_figures": "VALIDATION_PICTURES validation_figures",
     "posteriors": "agreement_scatter exact_density joint_cloud marginals",
-    "ranks": "ecdf_difference ecdf_of pooled_rank_counts rank_band rank_plot",
     "ratios": "ratio_figure ratio_whiskers",
     "signatures": "effect_signature signature_figure",
     "style": "STYLE save show",
@@ -72,8 +70,6 @@ __all__ = [
     "belief_figure",
     "data_quality",
     "diagnosis_figure",
-    "ecdf_difference",
-    "ecdf_of",
     "effect_signature",
     "events",
     "exact_density",
@@ -86,10 +82,7 @@ __all__ = [
     "paper_pictures",
     "pedal_figure",
     "pedal_lines",
-    "pooled_rank_counts",
     "probability_figure",
-    "rank_band",
-    "rank_plot",
     "ratio_figure",
     "ratio_whiskers",
     "region",

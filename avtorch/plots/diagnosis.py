@@ -104,12 +104,6 @@ def _name_bars(ax: Axes, names: Sequence[str], *, narrow: bool, down: bool) -> N
 class DriveStretch:
     """The stretch of the drive in which the effect does most: `time` (row,) [s] from its log's start and `lines` by
     label, each (row,), of the quantity that `axis` names with its unit.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.plots.diagnosis import DriveStretch
-        >>> DriveStretch("speed [m/s]", np.arange(2.0), {"measured": np.zeros(2)}).axis
-        'speed [m/s]'
     """
 
     axis: str
@@ -118,15 +112,7 @@ class DriveStretch:
 
 
 def traces_of(found: Diagnosis) -> Traces:
-    """The traces of a diagnosis. Raises `InputError` where there are none.
-
-    Example:
-        >>> from avtorch import Leader, diagnose, simulate
-        >>> from avtorch.plots.diagnosis import traces_of
-        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1)).log()
-        >>> traces_of(diagnose(log, effects=["dead_time"], pairs=False)).channels
-        ('accel', 'speed')
-    """
+    """The traces of a diagnosis. Raises `InputError` where there are none."""
     if found.traces is None:
         raise InputError("traces: the diagnosis has none to draw")
     return found.traces
@@ -136,15 +122,6 @@ def stretch_of(found: Diagnosis, *, seconds: float = _SECONDS) -> DriveStretch:
     """What was measured, and what is simulated before and after the repair, where the effect does most.
 
     The channel is the acceleration, unless only the speed shows it. Raises `InputError` where there are no traces.
-
-    Example:
-        >>> from avtorch import Leader, diagnose, simulate
-        >>> from avtorch.gap import DeadTime, plant
-        >>> from avtorch.plots.diagnosis import stretch_of
-        >>> late = plant([DeadTime(0.4)], sigma=0.0)
-        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
-        >>> list(stretch_of(diagnose(log, effects=["dead_time"], pairs=False)).lines)
-        ['measured', 'baseline simulator', 'with dead_time']
     """
     traces = traces_of(found)
     errors = [(traces.measured - x).std(-1) for x in (traces.before, traces.after)]
@@ -196,14 +173,7 @@ def _liveliest(time: FloatArray, stretch: IntArray, size: FloatArray, seconds: f
 
 @dataclass(frozen=True)
 class EffectHistogram:
-    """Along an axis: the shares of the rows and of the effect's response between `edges` (bin + 1,), each (bin,).
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.plots.diagnosis import EffectHistogram
-        >>> EffectHistogram(np.arange(3.0), np.array([0.5, 0.5]), np.array([0.1, 0.9])).edges.shape
-        (3,)
-    """
+    """Along an axis: the shares of the rows and of the effect's response between `edges` (bin + 1,), each (bin,)."""
 
     edges: FloatArray
     rows: FloatArray = field(repr=False)
@@ -214,16 +184,6 @@ def histogram_of(found: Diagnosis, axis: Axis, *, bins: int = 30) -> EffectHisto
     """Where along `axis` (time, speed or command) the drive and the effect's response are.
 
     Raises `InputError` where there are no traces or the log has no such signal.
-
-    Example:
-        >>> from avtorch import Leader, diagnose, simulate
-        >>> from avtorch.gap import DeadTime, plant
-        >>> from avtorch.plots.diagnosis import histogram_of
-        >>> late = plant([DeadTime(0.4)], sigma=0.0)
-        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
-        >>> counts = histogram_of(diagnose(log, effects=["dead_time"], pairs=False), "command", bins=4)
-        >>> round(float(counts.rows.sum()), 6), round(float(counts.effect.sum()), 6)
-        (1.0, 1.0)
     """
     traces = traces_of(found)
     x = {"time": traces.time, "command": traces.command, "speed": traces.speed}.get(axis)

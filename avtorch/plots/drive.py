@@ -64,15 +64,6 @@ _LOGS_APART = 0.02  # of the whole, between two logs
 class DriveTime:
     """Where the rows of a diagnosis lie on one axis: `along` (row,) [s], several logs one behind the other; `begins` of
     the logs on it [s]; `uncounted` and `alarms` at their times on it; `onset` on it [s], where an effect sets in.
-
-    Example:
-        >>> from avtorch import Leader, diagnose, simulate
-        >>> from avtorch.gap import DeadTime, plant
-        >>> from avtorch.plots.drive import drive_time
-        >>> late = plant([DeadTime(0.4)], sigma=0.0)
-        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
-        >>> drive_time(diagnose(log, effects=["dead_time"], pairs=False)).begins
-        (0.0,)
     """
 
     along: FloatArray
@@ -112,13 +103,6 @@ def drive_time(found: Diagnosis) -> DriveTime:
 def envelope(time: FloatArray, values: FloatArray, stretch: IntArray, intervals: int) -> tuple[FloatArray, FloatArray]:
     """`values` (row,) over `time` as a line of at most two points for each of `intervals`, its least and its greatest
     value in the order in which they come; broken by NaN between stretches.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.plots.drive import envelope
-        >>> time = np.arange(8.0)
-        >>> envelope(time, np.array([0, 3, 1, 0, 0, 0, -2, 0.0]), np.zeros(8, int), 2)[1].tolist()
-        [0.0, 3.0, 0.0, -2.0]
     """
     length = (time[-1] - time[0]) / intervals if len(time) > 1 else 1.0
     cell = np.minimum((time - time[0]) / max(length, 1e-12), intervals - 1).astype(int)
@@ -137,14 +121,7 @@ def envelope(time: FloatArray, values: FloatArray, stretch: IntArray, intervals:
 
 @dataclass(frozen=True)
 class DrivePanel:
-    """A panel of the whole drive: what its axis shows, and its lines (row,) by label.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.plots.drive import DrivePanel
-        >>> list(DrivePanel("speed [m/s]", {"measured": np.zeros(2)}).lines)
-        ['measured']
-    """
+    """A panel of the whole drive: what its axis shows, and its lines (row,) by label."""
 
     label: str
     lines: Mapping[str, FloatArray] = field(repr=False)
@@ -155,15 +132,6 @@ def drive_panels(found: Diagnosis) -> list[DrivePanel]:
     a panel of its own; a simulated speed begins at the measured one every ten seconds (`Traces.begun_anew`).
 
     Raises `InputError` where there are no traces.
-
-    Example:
-        >>> from avtorch import Leader, diagnose, simulate
-        >>> from avtorch.gap import DeadTime, plant
-        >>> from avtorch.plots.drive import drive_panels
-        >>> late = plant([DeadTime(0.4)], sigma=0.0)
-        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
-        >>> [panel.label for panel in drive_panels(diagnose(log, effects=["dead_time"], pairs=False))]
-        ['acceleration [m/s²]', 'speed [m/s]']
     """
     traces = traces_of(found)
     panels = [] if "accel" in traces.channels else [DrivePanel("command [m/s²]", {"command": traces.command})]
@@ -265,20 +233,7 @@ def _channel(ax: Axes, axis: DriveTime, traces: Traces, panel: DrivePanel, inter
 
 # single manoeuvres --------------------------------------------------------------------------------------------------
 def manoeuvre_lines(ax: Axes, manoeuvre: Manoeuvre, traces: Traces) -> Axes:
-    """The accelerations of one manoeuvre over time, which is that of its log.
-
-    Example:
-        >>> import numpy as np
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.gap.result.manoeuvres import manoeuvres
-        >>> from avtorch.gap.result.traces import Traces
-        >>> from avtorch.plots.drive import manoeuvre_lines
-        >>> time = np.arange(0.0, 30.0, 0.05)
-        >>> u = np.where((time > 10) & (time < 15), -2.0, 0.0)
-        >>> traces = Traces(time, u, ("accel",), 0.9 * u[None], u[None], u[None], u, np.zeros(600, int))
-        >>> len(manoeuvre_lines(Figure().subplots(), manoeuvres(traces)[0], traces).lines)
-        4
-    """
+    """The accelerations of one manoeuvre over time, which is that of its log."""
     time = traces.time[manoeuvre.rows]
     for label, values in manoeuvre.lines.items():
         ax.plot(time, values, color=_COLOURS[label], lw=1.2, label=label)
@@ -297,18 +252,7 @@ def manoeuvre_figure(manoeuvre: Manoeuvre, traces: Traces) -> Figure:
 
 # what is left ------------------------------------------------------------------------------------------------------
 def residuals_of(found: Diagnosis) -> Residuals:
-    """The residuals of a diagnosis. Raises `InputError` where it has no traces.
-
-    Example:
-        >>> from avtorch import Leader, diagnose, simulate
-        >>> from avtorch.gap import DeadTime, plant
-        >>> from avtorch.plots.drive import residuals_of
-        >>> late = plant([DeadTime(0.4)], sigma=0.0)
-        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
-        >>> left = residuals_of(diagnose(log, effects=["dead_time"], pairs=False))
-        >>> left.channel, bool(left.after.std() < left.before.std())
-        ('accel', True)
-    """
+    """The residuals of a diagnosis. Raises `InputError` where it has no traces."""
     return Residuals.of(traces_of(found))
 
 

@@ -1,23 +1,145 @@
-"""The pictures of a validation: SGLD compared with quadrature and NUTS, window by window and all together."""
+"""The pictures of a validation: SGLD compared with quadrature and NUTS, for some windows and for all together."""
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
+from scipy.stats import uniform
+from torch import Tensor
 
-from avtorch.plots.chosen_windows import ChosenWindows, converged, relative_width
+from avtorch.arrays import FloatArray
+from avtorch.inference import Posterior, Quadrature
 from avtorch.plots.posteriors import agreement_reach, agreement_scatter, joint_cloud, marginals
-from avtorch.plots.ranks import METHODS, ecdf_difference, rank_plot
-from avtorch.plots.style import BLACK, short, styled
-from avtorch.plots.validation_ranks import POINTS, ecdfs_of, groups_of, ranks_of
-from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE
+from avtorch.plots.style import BLACK, BLUE, VERMILLION, short, styled
+from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE, arviz, sampling_diagnostics
 from avtorch.validation.validate import Validation
 
+#: Exact draws a window, for contours and ranks.
+EXACT = 4000
+#: Groups that SGLD's chains are joined into for their ranks, and draws of a group at most.
+GROUPS, MOST = 4, 1000
+
+
+@dataclass(frozen=True)
+class ChosenWindow:
+    """A window drawn individually: its number, its place among those NUTS was run on, what it represents."""
+
+    number: int
+    nuts: int | None
+    title: str
+
+
+class ChosenWindows:
+    """The windows drawn individually: with the widest, a median and the narrowest posterior of the lag.
+
+    They are of those NUTS was run on, if there are any, and converged, if any did.
+    """
+
+    def __init__(self, validation: Validation) -> None:
+        self.validation = validation
+        index = validation.nuts_index if len(validation.nuts_index) else validation.compared
+        sound = converged(validation, index)
+        index = index[sound] if bool(sound.any()) else index
+        width = relative_width(validation, index)[:, 0]
+        order = width.argsort(descending=True)
+        places = sorted({0, len(order) // 2, len(order) - 1})
+        words = {1: [""], 2: ["wide: ", "narrow: "], 3: ["wide: ", "middle: ", "narrow: "]}[len(places)]
+        self.windows = [
+            ChosenWindow(
+                number := int(index[order[p]]),
+                place(validation.nuts_index, number),
+                f"{word}window {number}, SD of $T_L$ {100 * float(width[order[p]]):.2g} %",
+            )
+            for word, p in zip(words, places, strict=True)
+        ]
+
+    @cached_property
+    def exact(self) -> Posterior | None:
+        """Independent draws of the joint posterior of the selected windows, in their order."""
+        index = torch.tensor([w.number for w in self.windows])
+        return self.validation.quadrature_draws(index, chains=1, draws=EXACT)
+
+    def groups(self, row: int, i: int) -> dict[str, FloatArray]:
+        """Draws of the `i`-th parameter by group, as many as are effective: SGLD's chains in four, NUTS, exact."""
+        found, window = self.validation, self.windows[row]
+        parts = found.sgld.draws[:, :, window.number, i].tensor_split(min(GROUPS, found.sgld.draws.shape[0]))
+        worth = self._effective(row, i, "SGLD") / len(parts)
+        named = {f"SGLD {k + 1}": evenly(x.flatten().numpy(), _count(worth, x)) for k, x in enumerate(parts)}
+        if window.nuts is not None:
+            drawn = found.nuts.flat[:, window.nuts, i]
+            named["NUTS"] = evenly(drawn.numpy(), _count(self._effective(row, i, "NUTS"), drawn))
+        return named if self.exact is None else {**named, "exact": self.exact.flat[:, row, i].numpy()}
+
+    def exact_probabilities(self, row: int, i: int) -> dict[str, FloatArray]:
+        """Of draws of the `i`-th parameter that are effective, the exact probability of what is below, by method."""
+        found, window = self.validation, self.windows[row]
+        exact = found.quadrature
+        assert exact is not None
+        drawn = {"SGLD": found.sgld.flat[:, window.number]}
+        if window.nuts is not None:
+            drawn["NUTS"] = found.nuts.flat[:, window.nuts]
+        out = {}
+        for method, draws in drawn.items():
+            some = torch.from_numpy(evenly(draws.numpy(), _count(self._effective(row, i, method), draws)))
+            one = Quadrature(exact.names, *(getattr(exact, f.name)[[window.number]] for f in fields(exact)[1:]))
+            out[method] = one.cdf(some[:, None])[:, 0, i].clamp(0, 1).numpy()
+        return out
+
+    @cached_property
+    def _of_nuts(self) -> Tensor:
+        return sampling_diagnostics(self.validation.nuts).ess_bulk
+
+    def _effective(self, row: int, i: int, method: str) -> float:
+        found, window = self.validation, self.windows[row]
+        if method == "SGLD":
+            return float(found.agreement.ess_bulk[place(found.compared, window.number), i])
+        return float(self._of_nuts[window.nuts, i])
+
+    def truth(self, window: ChosenWindow, name: str) -> float | None:
+        known = self.validation.windows.truth
+        return None if known is None else float(known[window.number, self.validation.names.index(name)])
+
+
+def evenly(values: FloatArray, count: int) -> FloatArray:
+    """`count` of the values, evenly taken."""
+    return values[np.linspace(0, len(values) - 1, count).astype(int)]
+
+
+def converged(validation: Validation, index: Tensor) -> Tensor:
+    """Windows whose chains and quadrature converged, ``(index,)`` bool."""
+    own = validation.sgld.converged[index]
+    return own if validation.quadrature is None else own & validation.quadrature.converged[index]
+
+
+def relative_width(validation: Validation, index: Tensor) -> Tensor:
+    """SD over mean by quadrature, or by SGLD where there is none, ``(index, parameter)``."""
+    known = validation.sgld if validation.quadrature is None else validation.quadrature
+    return known.sd[index] / known.mean[index]
+
+
+def _count(effective: float, draws: Tensor) -> int:
+    """An effective sample size as a number of draws: chains that stand still have none."""
+    return max(4, min(round(effective), len(draws.flatten()), MOST)) if math.isfinite(effective) else 4
+
+
+def place(index: Tensor, window: int) -> int | None:
+    """Where a window is in a list of windows."""
+    found = (index == window).nonzero()
+    return int(found[0]) if len(found) else None
+
+
 _NARROW = 4.0  # inches
+_COLOURS = {"SGLD": BLUE, "NUTS": VERMILLION, "exact": "#555555"}
+BINS = 10
+"""Of ranks."""
 
 METHOD = {"nuts": "NUTS", "quadrature": "quadrature"}
 Place = Literal["outside upper center", "outside lower center"]
@@ -49,7 +171,7 @@ def validation_figures(validation: Validation, *, narrow: bool = False) -> dict[
         "agreement.png": lambda: agreement_figure(validation, narrow=narrow),
     }
     if validation.quadrature is not None:
-        figures["ecdf.png"] = lambda: ecdf_figure(validation, narrow=narrow)
+        figures["ecdf.png"] = lambda: ecdf_figure(chosen, narrow=narrow)
     return figures
 
 
@@ -92,61 +214,52 @@ def joint_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
 
 @styled
 def ranks_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
-    """Ranks of groups of SGLD's chains, of NUTS and of exact draws in their common pool; a row a window."""
-    found, names = chosen.validation, chosen.validation.names
-    rows = groups_of(found) + 2
-    figure, axes = _panels(
-        len(chosen.windows), len(names), (_wide(names), 0.33 * rows + 0.6), beside=1.4, narrow=narrow
-    )
+    """Ranks of groups of SGLD's chains, of NUTS and of exact draws in their common pool, by ArviZ; a row a window."""
+    names = chosen.validation.names
+    rows = len(chosen.groups(0, 0))
+    size = (_wide(names), 0.33 * rows + 0.6)
+    figure, axes = _panels(len(chosen.windows), len(names), size, beside=0.9, narrow=narrow)
     for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
-        for name, counted, ax in zip(names, ranks_of(chosen, row), line, strict=True):
-            rank_plot(ax, counted.counts, effective=counted.effective)
-            if row == len(axes) - 1 or narrow:
-                ax.set_xlabel(f"rank of {short(name)} [-]")
-        for ax in () if narrow else line[1:]:
-            ax.set_yticklabels([])
+        for i, (name, ax) in enumerate(zip(names, line, strict=True)):
+            groups = chosen.groups(row, i)
+            least = min(map(len, groups.values()))
+            pool = np.stack([evenly(x, least) for x in groups.values()])
+            arviz().plot_rank({name: pool}, bins=BINS, ax=ax, colors=[_COLOURS[group.split()[0]] for group in groups])
+            ax.set(title="", ylabel="", xlabel=f"rank of {short(name)}" if row == len(axes) - 1 or narrow else "")
+            ax.xaxis.label.set_size("medium")
+            ax.set_yticklabels(list(groups) if narrow or not i else [])
         line[0].set_title(window.title)
-    _title(
-        figure,
-        "Ranks of each group in the pool of all draws, as shares: bars are relative to the count expected, grey is "
-        "the band that holds all bars of a panel with 95 % probability, ± its half width (by effective sample sizes)",
-        narrow,
-    )
+    _title(figure, "Ranks of each group in the pool of all draws, as many as are effective: even bars agree", narrow)
     return figure
 
 
 @styled
-def ecdf_figure(validation: Validation, *, narrow: bool = False) -> Figure:
-    """Exact probabilities below the draws: their ECDF less the uniform one, a line a window, for SGLD and for NUTS."""
-    names, arms = validation.names, ecdfs_of(validation)
-    figure, axes = _panels(len(arms), len(names), (_wide(names), 2.7), beside=0.5, sharey="row", narrow=narrow)
-    for line, arm in zip(axes, arms, strict=True):
-        reach = 0.0
+def ecdf_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
+    """Exact probabilities below the draws: their ECDF less the uniform one and its 95 % band, by ArviZ; a row a window.
+
+    Draws count by their effective sample size.
+    """
+    names = chosen.validation.names
+    figure, axes = _panels(len(chosen.windows), len(names), (_wide(names), 2.4), beside=0.5, narrow=narrow)
+    for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
         for i, (name, ax) in enumerate(zip(names, line, strict=True)):
-            inside, taken = arm.inside[i], len(arm.windows)
-            drawn = arm.less_uniform[i]
-            if taken:
-                ecdf_difference(ax, {}, arm.band[i], label="95 % band at the median effective sample size")
-            at = np.linspace(0, 1, POINTS + 1)
-            for mask, look in (
-                (inside, {"linewidth": 0.7, "alpha": float(np.clip(12 / max(1, taken), 0.15, 0.8))}),
-                (~inside, {"linewidth": 1.0, "linestyle": "--"}),
-            ):
-                ax.plot(at, drawn[mask].T, color=METHODS[arm.method], zorder=2, **look)
-            reach = max([reach, ax.get_ylim()[1], 1.05 * float(np.abs(drawn).max(initial=0))])
-            ax.set_title(f"{arm.method}, {short(name)}: {inside.sum()} of {taken} inside")
-        line[0].set_ylim(-reach, reach)
-        line[0].set_ylabel("ECDF less uniform [-]")
-    for ax in axes[-1]:
-        ax.set_xlabel("exact probability below a draw [-]")
-    for ax in axes.flat if not narrow else ():
-        ax.label_outer()
-    _title(
-        figure,
-        "One line per converged window, dashed where it leaves its own 95 % band (1 in 20 at most by chance);"
-        " grey: the band at the median effective sample size",
-        narrow,
-    )
+            for method, values in chosen.exact_probabilities(row, i).items():
+                look = {"color": _COLOURS[method]}
+                arviz().plot_ecdf(
+                    values,
+                    cdf=uniform.cdf,
+                    eval_points=np.linspace(0.01, 0.99, 99),
+                    difference=True,
+                    confidence_bands="simulated",
+                    random_state=0,
+                    ci_prob=0.95,
+                    plot_kwargs={**look, "label": method},
+                    fill_kwargs={**look, "alpha": 0.15},
+                    ax=ax,
+                )
+            ax.set(xlabel=f"exact probability below a draw of {short(name)}", ylabel="" if i else "ECDF less uniform")
+        line[0].set_title(window.title)
+    _legend(figure, axes, narrow=narrow)
     return figure
 
 

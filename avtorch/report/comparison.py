@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from avtorch.gap.quantity import Quantity, unit_of, words_of
-from avtorch.report.origin import Origin
-from avtorch.report.page import Page, Picture, Section, Tone, picture_of, written
+from avtorch.report.page import Origin, Page, Picture, Section, Tone, picture_of
 from avtorch.report.table import Table
 
 if TYPE_CHECKING:
@@ -43,17 +40,6 @@ def comparison_html(
 
     page = _of_drives(found, notes) if isinstance(found, Comparison) else _of_simulators(found, notes)
     return page.html(origin)
-
-
-def write_comparison_page(
-    found: Comparison | SimulatorComparison,
-    folder: str | PathLike[str],
-    *,
-    notes: Sequence[str] = (),
-    origin: Origin | None = None,
-) -> Path:
-    """Write `comparison.html` into `folder`; returns its path. Raises `InputError` where it cannot be written."""
-    return written(comparison_html(found, notes=notes, origin=origin), folder, "comparison.html")
 
 
 def comparison_tables(found: Comparison | SimulatorComparison) -> tuple[Table, ...]:

@@ -18,9 +18,7 @@ from avtorch.gap.result.budget import percent as share_of
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.manoeuvres import Manoeuvre, manoeuvres
 from avtorch.report.diagnosis_tables import budget_table, candidate_table, measure_table
-from avtorch.report.markdown import markdown
-from avtorch.report.origin import Origin
-from avtorch.report.page import Page, Section, written
+from avtorch.report.page import Origin, Page, Section, markdown, written
 from avtorch.report.table import Table
 
 _NO_CLAIM = "This page lists what one run found. It claims no compliance with a regulation or a standard."

@@ -25,8 +25,7 @@ from avtorch.report.diagnosis_tables import (
     place_table,
     setting_table,
 )
-from avtorch.report.origin import Origin
-from avtorch.report.page import Page, Picture, Section, picture_of, small_picture, written
+from avtorch.report.page import Origin, Page, Picture, Section, picture_of, small_picture, written
 from avtorch.report.residuals import residuals
 from avtorch.report.table import Table, of_numbers
 

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from avtorch.errors import InputError
 from avtorch.io.clock import from_start
 from avtorch.plots.time import belief_figure, probability_figure
-from avtorch.report.origin import Origin
-from avtorch.report.page import Page, Picture, Section, Tone, picture_of, written
+from avtorch.report.page import Origin, Page, Picture, Section, Tone, picture_of
 from avtorch.report.window_tables import alert_table, probability_table, window_table
 from avtorch.results import estimates_answer
 
@@ -54,19 +51,6 @@ def estimates_html(
         _tone(windows, spread),
     )
     return page.html(origin)
-
-
-def write_estimates_page(
-    found: Estimates,
-    log: Log,
-    folder: str | PathLike[str],
-    *,
-    notes: Iterable[str] = (),
-    origin: Origin | None = None,
-    name: str | None = None,
-) -> Path:
-    """Write `estimates.html` into `folder`; returns its path. Raises `InputError` where it cannot be written."""
-    return written(estimates_html(found, log, notes=notes, origin=origin, name=name), folder, "estimates.html")
 
 
 _UNITS = {"T_L": " s", "K_L": ""}

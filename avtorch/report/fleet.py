@@ -13,8 +13,7 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from avtorch.errors import InputError, printable, quoted
-from avtorch.report.origin import Origin
-from avtorch.report.page import Page, Picture, Section, fragment, picture_of, text_of, written
+from avtorch.report.page import Origin, Page, Picture, Section, fragment, picture_of, text_of, written
 from avtorch.report.table import Table
 
 Answer = Mapping[str, Any]

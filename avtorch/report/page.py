@@ -9,9 +9,11 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
+import platform
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
@@ -21,12 +23,64 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
 from avtorch.errors import printable
-from avtorch.io import atomic
-from avtorch.report.origin import Origin, versions
+from avtorch.io import atomic, fingerprint
 from avtorch.report.table import Table
+from avtorch.version import __version__
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Origin:
+    """`command`: the exact line that made the answer, None where it was no command. `files`: SHA-256 [64 hex digits] of
+    each file that was read, by its name without its folder. `settings`: the same over the settings in force.
+    """
+
+    command: str | None = None
+    files: Mapping[str, str] = field(default_factory=dict)
+    settings: str | None = None
+
+    @classmethod
+    def of(
+        cls,
+        command: str | None = None,
+        paths: Iterable[str | PathLike[str]] = (),
+        settings: Mapping[str, Any] | None = None,
+    ) -> Origin:
+        """With the hashes of those files, and of those in folders among them, and of `settings`.
+
+        Raises `OSError` for a file that cannot be read.
+        """
+        files: dict[str, str] = {}
+        for path in map(Path, paths):
+            inside = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+            for file in inside:
+                name = str(file.relative_to(path.parent))
+                with file.open("rb") as stream:
+                    # two drives may have one name in two folders
+                    files[_free(name, files)] = hashlib.file_digest(stream, "sha256").hexdigest()
+        return cls(command, files, None if settings is None else fingerprint(settings))
+
+
+def _free(name: str, taken: Mapping[str, str]) -> str:
+    number = 2
+    free = name
+    while free in taken:
+        free, number = f"{name} ({number})", number + 1
+    return free
+
+
+def versions() -> str:
+    """Of avtorch and of what computes, in one line."""
+    found = {
+        "avtorch": __version__,
+        "torch": version("torch"),
+        "numpy": version("numpy"),
+        "Python": platform.python_version(),
+    }
+    return ", ".join(f"{name} {number}" for name, number in found.items())
+
 
 Tone = Literal["blue", "green", "amber"]
 
@@ -205,3 +259,35 @@ def _digest(script: str) -> str:
 def _seen(value: Any) -> Any:
     """Text of a page, its control characters escaped; markup of our own, the pictures, as it is."""
     return value if isinstance(value, Markup) or not isinstance(value, str) else printable(value)
+
+
+def markdown(page: Page, origin: Origin | None = None) -> str:
+    """The page as Markdown; whatever a file's name holds stays text."""
+    made = origin or Origin()
+    command = (f"    {printable(made.command)}",) if made.command else ()
+    foot = [f"versions: {versions()}", *(f"SHA-256 of {name}: {digits}" for name, digits in made.files.items())]
+    foot += [f"SHA-256 of the settings: {made.settings}"] if made.settings else []
+    parts = [f"# {_text(page.kind)}", _text(page.of), f"**{_text(page.lead.title)}**", *_body(page.lead)]
+    for section in page.sections:
+        parts += [] if section.empty else [f"## {_text(section.title)}", *_body(section)]
+    parts += ["## How this page was made", *command, *_body(Section("", items=tuple(foot)))]
+    return "\n\n".join(parts) + "\n"
+
+
+def _body(section: Section) -> list[str]:
+    lists = ["\n".join(f"- {_text(item)}" for item in section.items)] if section.items else []
+    return [*map(_text, section.lines), *map(_table, section.tables), *map(_text, section.soft), *lists]
+
+
+def _table(table: Table) -> str:
+    sides = ["---:" if title in table.numeric else "---" for title in table.columns]
+    return "\n".join([_row(table.columns), _row(sides, raw=True), *map(_row, table.rows)])
+
+
+def _row(cells: Iterable[str], *, raw: bool = False) -> str:
+    return f"| {' | '.join(cells if raw else map(_text, cells))} |"
+
+
+def _text(text: str) -> str:
+    """With a backslash before all that Markdown would read otherwise."""
+    return re.sub(r"([\\`*_{}\[\]<>#|])", r"\\\1", printable(text))

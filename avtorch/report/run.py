@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +14,7 @@ from numpy.typing import ArrayLike
 from avtorch.arrays import FloatArray
 from avtorch.plots.plane import loop_of, region_figure
 from avtorch.plots.time import Motion, Steps, motion_figure, overview_figure
-from avtorch.report.origin import Origin
-from avtorch.report.page import Page, Picture, Section, picture_of, written
+from avtorch.report.page import Origin, Page, Picture, Section, picture_of
 from avtorch.report.table import Table, of_numbers
 from avtorch.report.window_tables import window_table
 from avtorch.results import MEASURES
@@ -99,14 +96,6 @@ def run_html(
         "green" if answer["windows"][-1]["p_string_stable"] >= 0.95 else "amber",
     )
     return page.html(origin)
-
-
-def write_run_page(answer: Mapping[str, Any], *args: Any, folder: str | PathLike[str], **more: Any) -> Path:
-    """Write `run.html` into `folder`; returns its path. Raises `InputError` where it cannot be written.
-
-    The other arguments are those of `run_html`.
-    """
-    return written(run_html(answer, *args, **more), folder, "run.html")
 
 
 def _headline(answer: Mapping[str, Any]) -> str:

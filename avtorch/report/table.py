@@ -15,11 +15,6 @@ class Table:
     `caption`: what the table shows. `numeric`: titles of the columns of numbers. `marked`: numbers of the rows in bold;
     `soft`: of those that a terminal dims.
     Raises `InputError` where a row has another number of cells than there are columns.
-
-    Example:
-        >>> from avtorch.report.table import Table
-        >>> Table("Speeds", ("car", "speed [m/s]"), (("ego", "12.5"),), numeric=("speed [m/s]",)).numeric
-        ('speed [m/s]',)
     """
 
     caption: str
@@ -40,12 +35,6 @@ class Table:
 def of_numbers(
     caption: str, columns: Sequence[str], values: Iterable[Sequence[float]], formats: Sequence[str]
 ) -> Table:
-    """A table of numbers alone: `values` (row, column), each column written by its format.
-
-    Example:
-        >>> from avtorch.report.table import of_numbers
-        >>> of_numbers("Speed", ("time [s]", "speed [m/s]"), [(0.0, 12.5)], (".1f", ".2f")).rows
-        (('0.0', '12.50'),)
-    """
+    """A table of numbers alone: `values` (row, column), each column written by its format."""
     rows = tuple(tuple(format(x, f) for x, f in zip(row, formats, strict=True)) for row in values)
     return Table(caption, tuple(columns), rows, numeric=tuple(columns))

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import ks_2samp, kstest
 
-from avtorch.inference.units import shown_unit
-from avtorch.plots.chosen_windows import ChosenWindows
-from avtorch.plots.posterior_figures import validation_figures
-from avtorch.plots.ranks import rank_band
-from avtorch.plots.validation_ranks import ecdfs_of, ranks_of
-from avtorch.report.origin import Origin
-from avtorch.report.page import Page, Picture, Section, picture_of, written
+from avtorch.inference.arviz_export import shown_unit
+from avtorch.plots.posterior_figures import ChosenWindows, validation_figures
+from avtorch.report.page import Origin, Page, Picture, Section, picture_of
 from avtorch.report.table import Table
 from avtorch.results import validation_answer
 from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE
@@ -36,9 +31,9 @@ _SAYS = {
     "posterior, with the limits asked for.",
     "marginals": "Exact densities of each parameter with histograms of the draws of SGLD and of NUTS.",
     "joint": "Clouds of SGLD's draws of lag and gain within the 50 and 90 % regions of the references.",
-    "ranks": "Bars of the ranks of groups of chains in the pool of all draws, within the band that chance explains.",
-    "ecdf": "Lines, one a window: the share of draws below each exact probability, less what it should be, with the "
-    "band that chance explains.",
+    "ranks": "Bars of the ranks of groups of chains in the pool of all draws, as many as are effective.",
+    "ecdf": "Lines of the share of draws below each exact probability, less what it should be, with the band that "
+    "chance explains.",
 }
 
 
@@ -61,11 +56,6 @@ def validation_html(found: Validation, *, origin: Origin | None = None) -> str:
         "green" if found.verdict.agree else "amber",
     )
     return page.html(origin)
-
-
-def write_validation_page(found: Validation, folder: str | PathLike[str], *, origin: Origin | None = None) -> Path:
-    """Write `validation.html` into `folder`; returns its path. Raises `InputError` where it cannot be written."""
-    return written(validation_html(found, origin=origin), folder, "validation.html")
 
 
 def _pictures(found: Validation) -> dict[str, Picture]:
@@ -134,7 +124,7 @@ def _tables_behind(found: Validation) -> dict[str, Table]:
         "ranks": _ranks(chosen),
     }
     if found.quadrature is not None:
-        tables["ecdf"] = _ecdfs(found)
+        tables["ecdf"] = _ecdfs(chosen)
     return tables
 
 
@@ -185,27 +175,25 @@ def _correlations(chosen: ChosenWindows) -> Table:
 
 
 def _ranks(chosen: ChosenWindows) -> Table:
-    """A row a window and parameter: the bar of each group that is farthest from the count expected, and its band."""
-    rows, groups = [], ()
-    for row, window in enumerate(chosen.windows):
-        for name, ranks in zip(chosen.validation.names, ranks_of(chosen, row), strict=True):
-            groups, outside, cells = tuple(ranks.counts), 0, []
-            for group, (low, high) in rank_band(ranks.counts, effective=ranks.effective).items():
-                count = ranks.counts[group]
-                off = count * len(count) / count.sum() - 1
-                outside += int(((off < low) | (off > high)).sum())
-                cells.append(f"{100 * off[abs(off).argmax()]:+.0f} (±{50 * (high - low):.0f})")
-            rows.append((f"{window.number}: {name}", *cells, str(outside)))
-    columns = ("window and parameter", *groups, "bars outside")
-    return Table("Farthest bar and half width of its band [%]", columns, tuple(rows), numeric=columns[1:])
-
-
-def _ecdfs(found: Validation) -> Table:
+    """A row a window and parameter: how probable so large a distance from the pool of the others is, by group."""
+    groups = tuple(chosen.groups(0, 0))
     rows = []
-    for arm in ecdfs_of(found):
-        far = abs(arm.less_uniform).max(-1)
-        for name, inside, reach in zip(found.names, arm.inside, far, strict=True):
-            where = (f"{reach.max():.3f}", str(int(arm.windows[reach.argmax()]))) if len(reach) else ("", "")
-            rows.append((f"{arm.method}: {name}", str(len(inside)), str(inside.sum()), *where))
-    columns = ("method and parameter", "windows", "inside their band", "farthest from uniform", "in window")
-    return Table("Windows within their 95 % bands", columns, tuple(rows), numeric=columns[1:])
+    for row, window in enumerate(chosen.windows):
+        for i, name in enumerate(chosen.validation.names):
+            drawn = chosen.groups(row, i)
+            others = {g: np.concatenate([x for other, x in drawn.items() if other != g]) for g in drawn}
+            found = (f"{ks_2samp(drawn[g], others[g]).pvalue:.2g}" if g in drawn else "" for g in groups)
+            rows.append((f"{window.number}: {name}", *found))
+    columns = ("window and parameter", *groups)
+    return Table("p-value of each group beside the others (Kolmogorov-Smirnov)", columns, tuple(rows), columns[1:])
+
+
+def _ecdfs(chosen: ChosenWindows) -> Table:
+    rows = []
+    for row, window in enumerate(chosen.windows):
+        for i, name in enumerate(chosen.validation.names):
+            tests = {method: kstest(x, "uniform") for method, x in chosen.exact_probabilities(row, i).items()}
+            for method, test in tests.items():
+                rows.append((f"{window.number}: {name}, {method}", f"{test.statistic:.3f}", f"{test.pvalue:.2g}"))
+    columns = ("window, parameter and method", "farthest from uniform", "p-value")
+    return Table("Distance from uniform (Kolmogorov-Smirnov)", columns, tuple(rows), numeric=columns[1:])

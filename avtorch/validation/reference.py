@@ -80,9 +80,8 @@ def exact_draws(
     Cells of a coarse grid are drawn by their weight and points in them uniformly; importance resampling then corrects
     them to the density itself. There is no Markov chain: the chains are only a layout.
 
-    Args:
-        density, quadrature: of the same windows; the quadrature's moments place the grid.
-        mode: of the density, if known; its correlations tilt the grid.
+    `density`, `quadrature`: of the same windows; the quadrature's moments place the grid. `mode`: of the density, if
+    known; its correlations tilt the grid.
     """
     mode = find_mode(density) if mode is None else mode
     found = []
@@ -145,8 +144,7 @@ def _pick(weight: Tensor, share: Tensor) -> Tensor:
 class NutsSettings:
     """Chains, draws a chain and steps of adaptation of the NUTS reference.
 
-    Raises:
-        InputError: for fewer than 1 chain, 16 draws or 1 step of adaptation.
+    Raises `InputError` for fewer than 1 chain, 16 draws or 1 step of adaptation.
 
     Example:
         >>> from avtorch.validation import NutsSettings

@@ -65,8 +65,8 @@ def stein_discrepancy(
         flip: probability that the bootstrap's sign changes from one draw used to the next of its chain; 0.5 takes them
             as independent, less allows for their autocorrelation.
 
-    Raises:
-        InputError: for draws of another shape than the density's, fewer than two points, or ``flip`` not in (0, 0.5].
+    Raises `InputError` for draws of another shape than the density's, fewer than two points, or ``flip`` not in (0,
+    0.5].
     """
     if z.ndim != 4 or z.shape[2:] != (density.windows, len(density.names)):
         wanted = f"(chain, draw, {density.windows}, {len(density.names)})"

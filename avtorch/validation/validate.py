@@ -15,13 +15,13 @@ from torch import Tensor
 from avtorch.display import Card, Displayed, Frame
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
+from avtorch.inference.arviz_export import shown_unit
 from avtorch.inference.map import find_mode
 from avtorch.inference.posterior import Posterior
 from avtorch.inference.quadrature import Quadrature
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings
-from avtorch.inference.units import shown_unit
-from avtorch.io.source import LogSource, as_log
+from avtorch.io.log import LogSource, as_log
 from avtorch.validation.agreement import Agreement, AgreementVerdict, agreement, agreement_verdict, between
 from avtorch.validation.reference import (
     LATENT_NUTS,
@@ -199,8 +199,7 @@ def validate(
         nuts: its chains and draws; by default those of `NutsSettings`, and fewer in the latent form.
         progress: called with (done, of); or True for a bar, False for none, None for a bar in a notebook only.
 
-    Raises:
-        InputError: if ArviZ or Pyro is missing, for ``nuts_windows`` below 1, or for a log that cannot be used.
+    Raises `InputError` if ArviZ or Pyro is missing, for ``nuts_windows`` below 1, or for a log that cannot be used.
 
     Example:
         >>> from avtorch.inference import SamplerSettings

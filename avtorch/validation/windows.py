@@ -1,4 +1,9 @@
-"""Windows to validate on: synthetic ones over a range of vehicles and drives, and those of a log."""
+"""Windows to validate on: synthetic ones over a range of vehicles and drives, and those of a log.
+
+Windows drawn from the exact model of the jerk likelihood serve checks that need both to agree: ``a`` moves by the
+*measured* jerk, ``a + dt jerk``. An acceleration simulated without the noise would carry more information, and a
+posterior that does not use it would not be exactly calibrated.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +17,77 @@ from avtorch.errors import InputError
 from avtorch.inference.density import Density, SelectableDensity
 from avtorch.inference.form import ExcitationRule, Form, JerkForm
 from avtorch.inference.jerk import JerkDensity, JerkStatistics
-from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.latent import LatentForm
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
 from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.io.clock import ROUNDING_S
-from avtorch.io.log import Log
-from avtorch.io.no_command import no_command
+from avtorch.io.log import Log, no_command
 from avtorch.io.us06 import US06_SPEED_MPS
-from avtorch.validation.simulation import simulate_windows
+from avtorch.vehicle.glvd import glvd_jerk, glvd_rollout
+
+Amplitude = float | tuple[float, float]
+"""Of a command's first sine [m/s^2]: a number, or a range from which each window's is drawn evenly in the logarithm."""
+
+
+def sine_commands(
+    windows: int, rows: int, amplitude: Amplitude, *, dt: float = 0.01, generator: torch.Generator | None = None
+) -> Tensor:
+    """Two sines (2 and 5 rad/s, the second half as large) of random phases: demanded acceleration [m/s^2].
+
+    `amplitude`: see :data:`Amplitude`. `dt`: sampling step [s].
+
+    Returns:
+        Shape ``(window, time)``.
+
+    Raises `InputError` for an amplitude that is not positive, or a range that runs down.
+    """
+    low, high = amplitude if isinstance(amplitude, tuple) else (amplitude, amplitude)
+    if not 0 < low <= high:
+        raise InputError(f"amplitude: found {amplitude}, need a positive number or a rising range of them")
+    phase = 2 * torch.pi * torch.rand(2, windows, 1, generator=generator, dtype=torch.float64)
+    time = dt * torch.arange(rows, dtype=torch.float64)
+    size = low * (high / low) ** torch.rand(windows, 1, generator=generator, dtype=torch.float64)
+    return size * (torch.sin(2 * time + phase[0]) + 0.5 * torch.sin(5 * time + phase[1]))
+
+
+def simulate_windows(
+    z: Tensor, u: Tensor, *, dt: float = 0.01, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """Acceleration [m/s^2] and jerk [m/s^3] of vehicles ``z = log(T_L, K_L, sigma)`` under commands ``u``.
+
+    A lag below ``dt`` would diverge where a sample's jerk is held for ``dt``; it is held for ``T_L`` then.
+
+    `z`: shape ``(window, 3)``. `u`: demanded acceleration [m/s^2], ``(window, time)``; the acceleration starts at the
+    first command.
+
+    Returns:
+        ``a`` and ``jerk``, each ``(window, time)``.
+
+    Raises `InputError` for shapes that do not match.
+    """
+    if z.ndim != 2 or z.shape[1] != 3 or u.ndim != 2 or len(u) != len(z):
+        raise InputError(f"z, u: found shapes {tuple(z.shape)}, {tuple(u.shape)}, need (window, 3), (window, time)")
+    lag, gain, sigma = z.exp().unbind(-1)
+    noise = sigma[:, None] * torch.randn(u.shape, generator=generator, dtype=torch.float64)
+    # noise in jerk is a command of T/K noise
+    moved = glvd_rollout(u[:, 0], u + (lag / gain)[:, None] * noise, lag, gain, lag.clamp_max(dt), method="euler")
+    a = torch.cat([u[:, :1], moved[:, :-1]], -1)
+    return a, glvd_jerk(a, u, lag[:, None], gain[:, None]) + noise
+
+
+def statistics(
+    z: Tensor,
+    *,
+    rows: int = 200,
+    amplitude: Amplitude = 1.0,
+    dt: float = 0.01,
+    generator: torch.Generator | None = None,
+) -> JerkStatistics:
+    """The six sums of one fresh window of every vehicle ``z``; arguments of `sine_commands`, `simulate_windows`."""
+    u = sine_commands(len(z), rows, amplitude, dt=dt, generator=generator)
+    a, jerk = simulate_windows(z, u, dt=dt, generator=generator)
+    return JerkStatistics.from_samples(a, u, jerk)
+
 
 #: Ranges of the synthetic windows, each log-uniform but the gain, which is uniform: lag [s], gain [-], jerk noise
 #: [m/s^3], largest command [m/s^2].
@@ -77,8 +145,7 @@ class Windows:
     def select(self, index: Tensor) -> Windows:
         """The windows named by ``index``.
 
-        Raises:
-            InputError: if the density's windows cannot be taken apart.
+        Raises `InputError` if the density's windows cannot be taken apart.
         """
         if not isinstance(self.density, SelectableDensity):
             raise InputError(f"density: the windows of {type(self.density).__name__} cannot be selected")
@@ -99,8 +166,7 @@ def synthetic_windows(count: int, *, seed: int = 0) -> Windows:
     Lag, gain, noise and the largest command are drawn from `LAG`, `GAIN`, `NOISE` and `AMPLITUDE`; every other window
     has 200 and 500 points at 100 Hz; the command is a sum of three sines or a piece of the US06 cycle, as often.
 
-    Raises:
-        InputError: for ``count`` below 1.
+    Raises `InputError` for ``count`` below 1.
 
     Example:
         >>> from avtorch.inference import find_mode
@@ -121,8 +187,7 @@ def windows_from_prior(count: int, *, seed: int = 0, prior: Prior | None = None)
     """The same drives with vehicles drawn from the prior: the truths for which intervals must have their stated
     coverage.
 
-    Raises:
-        InputError: for ``count`` below 1.
+    Raises `InputError` for ``count`` below 1.
     """
     generator = _generator(count, seed)
     prior = Joint(default_actuation_prior(), default_jerk_noise_prior()) if prior is None else prior
@@ -135,13 +200,10 @@ def windows_of_log(log: Log, *, window: float = 2.0, count: int | None = None) -
     They lie on the grid of the sequential loop, which starts afresh with each segment; windows with fewer than
     `LEAST_ROWS` usable rows are left out.
 
-    Args:
-        window: length [s].
-        count: at most so many, evenly spread over the log; all by default.
+    `window`: length [s]. `count`: at most so many, evenly spread over the log; all by default.
 
-    Raises:
-        InputError: for a log without accel_cmd or without a usable window, a ``window`` that is not positive, or
-            ``count`` below 1.
+    Raises `InputError` for a log without accel_cmd or without a usable window, a ``window`` that is not positive, or
+    ``count`` below 1.
     """
     if log.accel_cmd is None:
         raise no_command(log, "; T_L and K_L need the demanded acceleration")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from avtorch.inference import JerkPoints, Mode, Quadrature, find_mode, integrate
-from avtorch.validation.simulation import simulate_windows
+from avtorch.validation.windows import simulate_windows
 
 #: Amplitude of the command [m/s^2]: weak, medium and strong excitation.
 AMPLITUDES = (0.1, 0.5, 2.0)

@@ -19,7 +19,7 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.inference import JerkStatistics, Posterior, integrate, sample
 from avtorch.inference.priors import Joint, default_actuation_prior, default_jerk_noise_prior
-from avtorch.validation.simulation import simulate_windows
+from avtorch.validation.windows import simulate_windows
 from benchmarks.estimators import CHANGE_S, drive
 from benchmarks.peers.problem import Windows
 from benchmarks.peers.torch_rows import density_of

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from avtorch import Log
-from avtorch.cli.alarms import read_alarms
+from avtorch.cli.diagnose import read_alarms
 from avtorch.errors import InputError
 from avtorch.gap.result.traces import Alarm
 

@@ -9,7 +9,7 @@ from avtorch.decision import Grid, History, Monitor, Setting, Strategist, Superv
 from avtorch.decision.supervisor import HISTORY_S, read_setting
 from avtorch.errors import InputError
 from avtorch.inference import BeliefStream
-from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.latent import LatentForm
 from avtorch.inference.sampler import SamplerSettings
 from avtorch.vehicle import MPC, ClosedLoop, GLVDPlant, Leader, LinearController, LowerLevel, simulate
 

@@ -11,9 +11,8 @@ import pytest
 from scipy.stats import binom
 
 from avtorch import ExternalSimulator, InputError, compare, compare_simulators
-from avtorch.external.compare_simulators import LogRatio
+from avtorch.external.compare_simulators import OTHERS, LogRatio
 from avtorch.external.simulator import DrivenPlant
-from avtorch.external.simulator_comparison import OTHERS
 from avtorch.gap import plant
 from avtorch.io import Log
 from tests.external.cars import OWN, drive

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from avtorch import ExternalSimulator, InputError, diagnose
-from avtorch.external.alignment import aligned
 from avtorch.external.answer import discrepancy, without_discrepancy
+from avtorch.external.driving import aligned
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.io import Log
 from tests.external.cars import OWN, drive

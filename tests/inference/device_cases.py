@@ -14,10 +14,8 @@ from avtorch.inference import (
     JerkPoints,
     JerkStatistics,
     PopulationMargin,
-    TorchDensity,
 )
-from avtorch.inference.latent import LatentDensity
-from avtorch.inference.latent_window import LatentWindow
+from avtorch.inference.latent import LatentDensity, LatentWindow
 from avtorch.inference.priors import (
     Joint,
     LogSpaceNormal,
@@ -27,6 +25,7 @@ from avtorch.inference.priors import (
     default_jerk_noise_prior,
 )
 from avtorch.vehicle.glvd import glvd_jerk, glvd_rollout
+from benchmarks.torch_density import TorchDensity
 
 F64 = torch.float64
 

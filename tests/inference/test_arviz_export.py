@@ -7,8 +7,8 @@ import torch
 
 from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, Posterior, SamplerSettings, sample
+from avtorch.inference.arviz_export import UNITS
 from avtorch.inference.latent import NOISE_PRIOR
-from avtorch.inference.units import UNITS
 
 pytest.importorskip("arviz")
 

@@ -26,7 +26,7 @@ from avtorch.inference import (
 from avtorch.inference.device import checked_device
 from avtorch.inference.estimators import ESTIMATORS
 from avtorch.inference.importance import weighted_draws
-from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.latent import LatentForm
 from avtorch.inference.sgld import SGLD
 from benchmarks.bias.control_variates import ControlVariates
 from benchmarks.peers.conjugate import sample_conjugate

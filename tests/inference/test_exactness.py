@@ -20,16 +20,16 @@ from avtorch.inference import (
     JerkPoints,
     Posterior,
     SamplerSettings,
-    TorchDensity,
     find_mode,
     integrate,
     sample,
 )
 from avtorch.inference.exactness import Moments, weighed
-from avtorch.inference.pareto import pareto_k
+from avtorch.inference.importance import pareto_k
 from avtorch.inference.posterior import effective_sample_size, normal_scores
 from avtorch.inference.sgld import harmonic
 from avtorch.validation.windows import synthetic_windows
+from benchmarks.torch_density import TorchDensity
 from tests.bars import BAR
 
 F64 = torch.float64

@@ -9,8 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from avtorch.inference.latent import LatentDensity, LatentWindow
-from avtorch.inference.latent_form import REFERENCE_NOISE, latent_excitation
+from avtorch.inference.latent import REFERENCE_NOISE, LatentDensity, LatentWindow, latent_excitation
 
 TIME = 0.01 * torch.arange(1000, dtype=torch.float64)
 

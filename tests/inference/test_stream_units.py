@@ -11,7 +11,7 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.inference import BeliefStream, SamplerSettings
-from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.latent import LatentForm
 from avtorch.inference.stream_units import StreamUnits
 from avtorch.io import Log
 from avtorch.vehicle.glvd import glvd_jerk, glvd_rollout

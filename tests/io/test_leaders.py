@@ -11,7 +11,7 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.io import Log, check, read_leader
-from avtorch.io.leaders import JOIN_SPEED_MPS, astazero, join_events, read_event, zalazone
+from avtorch.io.leaders import JOIN_SPEED_MPS, join_events, openacc, read_event
 from avtorch.io.tables import read_table
 from avtorch.io.us06 import US06_SPEED_MPS
 
@@ -148,14 +148,13 @@ def test_every_vehicle_of_the_platoons(data_dir):
     }
     for stem, vehicles in platoons.items():
         table = read_table(data_dir / f"{stem}.csv", header="Time")
-        read = astazero if "astazero" in stem else zalazone
         for vehicle in vehicles:
-            leader = read(table, vehicle)
+            leader = openacc(table, vehicle)
             assert np.isfinite(leader.speed).all()
             assert leader.spacing is None or np.nanmin(leader.spacing) >= 0
         for vehicle in set(range(12)) - set(vehicles):
             with pytest.raises(InputError, match="is not in it"):
-                read(table, vehicle)
+                openacc(table, vehicle)
 
 
 def test_spacing_belongs_to_the_vehicle_behind(data_dir):

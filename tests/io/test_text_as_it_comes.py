@@ -13,9 +13,7 @@ from hypothesis import strategies as st
 
 from avtorch.errors import InputError
 from avtorch.io import Log
-from avtorch.io.text.encoding import decoded
-from avtorch.io.text.layout import layout_of
-from avtorch.io.text.time_stamps import seconds_of
+from avtorch.io.text import decoded, layout_of, seconds_of
 
 from .drives import drive
 
@@ -188,7 +186,7 @@ def test_the_layout_is_found_in_what_is_there():
 
 
 def test_a_bomb_stops_at_the_limit(monkeypatch):
-    from avtorch.io.text import encoding
+    from avtorch.io import text as encoding
 
     monkeypatch.setattr(encoding, "MOST_BYTES", 10_000)
     with pytest.raises(InputError, match="holds over 10,000 bytes"):
@@ -196,7 +194,7 @@ def test_a_bomb_stops_at_the_limit(monkeypatch):
 
 
 def test_several_gzip_members_are_one_file():
-    from avtorch.io.text.encoding import unzipped
+    from avtorch.io.text import unzipped
 
     assert unzipped("lap.gz", gzip.compress(b"time,") + gzip.compress(b"speed")) == b"time,speed"
     assert decoded("lap.csv", b"\xef\xbb\xbfa")[0] == "a"

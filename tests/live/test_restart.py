@@ -22,7 +22,7 @@ from avtorch.live import (
     Stop,
     watch_source,
 )
-from avtorch.live import kept_cars as kept_cars_module
+from avtorch.live import watch_source as kept_cars_module
 from tests.live.drives import fleet, lines
 
 CHUNK = 997  # bytes, so that batches end in the middle of rows and windows

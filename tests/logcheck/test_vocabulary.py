@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from avtorch.logcheck.header import header_of
-from avtorch.logcheck.vocabulary import likeness
+from avtorch.logcheck.vocabulary import header_of, likeness
 
 
 @pytest.mark.parametrize(

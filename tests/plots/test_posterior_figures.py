@@ -8,9 +8,11 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from scipy.stats import kstest
 
 from avtorch import plots
 from avtorch.inference import Posterior, SamplerSettings, integrate
+from avtorch.plots.posterior_figures import ChosenWindows
 from avtorch.validation.agreement import AgreementVerdict, agreement, between
 from avtorch.validation.reference import exact_draws
 from avtorch.validation.stein import Stein
@@ -87,16 +89,20 @@ def test_windows_shown_go_from_wide_to_narrow(validation: Validation) -> None:
     assert all(t[1].startswith("SGLD inside") for t in titles)
 
 
-def test_ecdf_figure_counts_windows_and_shows_a_shift(validation: Validation) -> None:
-    figure = plots.validation_figures(validation)["ecdf.png"]()
-    assert len(figure.axes) == 6
+def test_exact_probabilities_are_uniform_and_show_a_shift(validation: Validation) -> None:
     sgld = validation.sgld
     draws = sgld.draws.clone()
     draws[..., 1] += 0.5 * sgld.sd[:, 1]
     shifted = dataclasses.replace(validation, sgld=dataclasses.replace(sgld, draws=draws))
-    titles = [ax.get_title("left") for ax in plots.validation_figures(shifted)["ecdf.png"]().axes]
-    converged = int((sgld.converged & validation.quadrature.converged).sum())  # type: ignore[union-attr]
-    assert titles[1] == f"SGLD, $K_L$: 0 of {converged} inside"
+    p_values = [
+        [kstest(ChosenWindows(found).exact_probabilities(0, i)["SGLD"], "uniform").pvalue for i in range(3)]
+        for found in (validation, shifted)
+    ]
+    assert min(p_values[0]) > 1e-3
+    assert p_values[1][0] == p_values[0][0]
+    assert p_values[1][1] < 1e-9
+    names = ["SGLD 1", "SGLD 2", "SGLD 3", "SGLD 4", "NUTS", "exact"]
+    assert list(ChosenWindows(validation).groups(0, 0)) == names
 
 
 @pytest.mark.slow

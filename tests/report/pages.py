@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import avtorch
-from avtorch.external.simulator_comparison import Difference, ErrorsOfTwo, SimulatorComparison
+from avtorch.external.compare_simulators import Difference, ErrorsOfTwo, SimulatorComparison
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import Change, ChangeCause, ChangePart, Comparison
 from avtorch.gap.result.log_facts import LogFacts

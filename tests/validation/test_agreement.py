@@ -15,8 +15,7 @@ from avtorch.inference.priors import LogSpaceNormal
 
 pytest.importorskip("arviz")
 
-from avtorch.validation.agreement import Agreement, agreement, between
-from avtorch.validation.diagnostics import sampling_diagnostics, superchains
+from avtorch.validation.agreement import Agreement, agreement, between, sampling_diagnostics, superchains
 from tests.bars import BAR
 
 LOG_SD = 0.05

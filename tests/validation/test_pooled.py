@@ -9,7 +9,7 @@ import torch
 
 from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, JerkStatistics, integrate
-from avtorch.validation.simulation import simulate_windows, sine_commands
+from avtorch.validation.windows import simulate_windows, sine_commands
 from benchmarks.pooled import (
     FreeNoise,
     PooledComparison,

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from avtorch.errors import InputError
-from avtorch.validation.uniformity import bonferroni, chi2_p_value, dispersion_p_value, ecdf_band, ecdf_p_value
+from benchmarks.uniformity import bonferroni, chi2_p_value, dispersion_p_value, ecdf_band, ecdf_p_value
 from tests.bars import BAR
 
 RUNS, N, DRAWS = 2000, 300, 19

@@ -16,8 +16,7 @@ from avtorch.errors import InputError, quoted
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.effect import Effect, effect_class
 from avtorch.gap.simulator.force_table import FREE_FORMS
-from avtorch.io.opening import place
-from avtorch.io.toml import parse_toml, read_toml
+from avtorch.io.opening import parse_toml, place, read_toml
 from avtorch.numeral import numeral
 from avtorch.vehicle.arguments import tensor
 

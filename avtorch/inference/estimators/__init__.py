@@ -2,11 +2,10 @@
 squares and joint Kalman filters."""
 
 from avtorch.inference.estimators.choose import ESTIMATORS, make_estimator
-from avtorch.inference.estimators.importance import ImportanceSampling
 from avtorch.inference.estimators.kalman import JointEKF, JointUKF
-from avtorch.inference.estimators.map import MaximumAPosteriori
 from avtorch.inference.estimators.rls import RecursiveLeastSquares
 from avtorch.inference.estimators.windowed import Estimator
+from avtorch.inference.sequential import ImportanceSampling, MaximumAPosteriori
 
 __all__ = [
     "ESTIMATORS",

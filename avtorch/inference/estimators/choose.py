@@ -6,13 +6,11 @@ import inspect
 from typing import Any
 
 from avtorch.errors import InputError
-from avtorch.inference.estimators.importance import ImportanceSampling
 from avtorch.inference.estimators.kalman import JointEKF, JointUKF
-from avtorch.inference.estimators.map import MaximumAPosteriori
 from avtorch.inference.estimators.rls import RecursiveLeastSquares
 from avtorch.inference.estimators.windowed import Estimator, WindowedEstimator
 from avtorch.inference.form import Form
-from avtorch.inference.sequential import SequentialInference
+from avtorch.inference.sequential import ImportanceSampling, MaximumAPosteriori, SequentialInference
 
 ESTIMATORS: dict[str, type[SequentialInference] | type[WindowedEstimator]] = {
     "sgld": SequentialInference,
@@ -40,15 +38,7 @@ def make_estimator(name: str, form: Form, *, vehicles: int = 1, **options: Any) 
     ``options`` are its own: those of :class:`SequentialInference` for ``sgld`` and ``map``, ``forgetting`` for ``rls``,
     ``drift`` and ``noise`` for ``ekf`` and ``ukf``, and ``actuation_prior``, ``kept`` and ``seed`` for all.
 
-    Raises:
-        InputError: for an unknown name, an option that the estimator does not have, or one out of range.
-
-    Example:
-        >>> from avtorch.inference import JerkForm
-        >>> from avtorch.inference.estimators import make_estimator
-        >>> rls = make_estimator("rls", JerkForm(), vehicles=3, forgetting=0.99)
-        >>> type(rls).__name__, tuple(rls.belief.mean.shape)
-        ('RecursiveLeastSquares', (3, 3))
+    Raises `InputError` for an unknown name, an option that the estimator does not have, or one out of range.
     """
     made = ESTIMATORS.get(name)
     if made is None:

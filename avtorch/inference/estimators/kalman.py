@@ -29,10 +29,8 @@ from avtorch.inference.belief import Summary
 from avtorch.inference.estimators.windowed import WindowedEstimator
 from avtorch.inference.form import Form, JerkForm, Rows
 from avtorch.inference.jerk import JerkStatistics
-from avtorch.inference.latent import NOISE_PRIOR
-from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.latent import GAP, NOISE_PRIOR, LatentForm
 from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, Step, discretise, initial_covariance
-from avtorch.inference.latent_window import GAP
 
 PLAUSIBLE = ((0.01, 20.0), (0.02, 20.0))
 """Bounds of ``T_L`` [s] and ``K_L``; a filter that leaves them has diverged, and restarts from the prior."""
@@ -101,9 +99,7 @@ class StateModel(Protocol):
 class JerkState:
     """``(log T_L, log K_L)`` as a random walk, observed through Eq. 1: ``jerk = (K_L u - a)/T_L + N(0, sigma^2)``.
 
-    Args:
-        sigma: jerk noise [m/s³], ``(vehicle,)``.
-        drift: SD of the walk per square root of a second, of both logarithms.
+    `sigma`: jerk noise [m/s³], ``(vehicle,)``. `drift`: SD of the walk per square root of a second, of both logarithms.
     """
 
     def __init__(self, sigma: Float[Tensor, " vehicle"], drift: float) -> None:
@@ -218,12 +214,10 @@ class JointKalman(WindowedEstimator):
     latent form it is ``noise``, which the belief repeats without spread. A window in which the filter diverges does not
     count as converged: the belief is carried over and the filter begins anew.
 
-    Args:
-        drift: SD of the walk of both logarithms per square root of a second.
-        noise: levels by name for the latent form, in the units of ``NOISE_PRIOR``, whose medians are the default.
+    `drift`: SD of the walk of both logarithms per square root of a second. `noise`: levels by name for the latent form,
+    in the units of ``NOISE_PRIOR``, whose medians are the default.
 
-    Raises:
-        InputError: for a form without a state model, a ``drift`` below 0, or noise that the form does not have.
+    Raises `InputError` for a form without a state model, a ``drift`` below 0, or noise that the form does not have.
     """
 
     def __init__(
@@ -261,9 +255,7 @@ class JointKalman(WindowedEstimator):
     ) -> tuple[GaussianState, Float[Tensor, " vehicle"]]:
         """Filter all usable rows of a window; after a gap or an unused row all but the parameters restarts.
 
-        Args:
-            actuation: belief in ``(log T_L, log K_L)`` at the first row.
-            columns: the measured signals, one a channel.
+        `actuation`: belief in ``(log T_L, log K_L)`` at the first row. `columns`: the measured signals, one a channel.
 
         Returns:
             The belief in them after the last row, and the log likelihood ``(vehicle,)``.
@@ -345,16 +337,7 @@ def _where(on: Tensor, state: GaussianState, other: GaussianState) -> GaussianSt
 
 
 class JointEKF(JointKalman):
-    """One tangent a row: cheap, and overconfident where the belief is wide against the model's curvature.
-
-    Example:
-        >>> from avtorch import BeliefStream, GLVDPlant, Leader, simulate
-        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-        >>> rows = {"accel": run.accel[:, 0], "accel_cmd": run.accel_cmd[:, 0], "jerk": run.jerk[:, 0]}
-        >>> stream = BeliefStream(check_units=False, estimator="ekf", drift=0.02)  # made of JointEKF
-        >>> [round(w.belief.stat("K_L")["mean"], 1) for w in stream.feed(run.time, rows) + stream.flush()]
-        [0.9, 0.9]
-    """
+    """One tangent a row: cheap, and overconfident where the belief is wide against the model's curvature."""
 
     def predict(self, model: StateModel, state: GaussianState, row: Observation) -> GaussianState:
         slope = model.slope(state.mean, row)
@@ -372,16 +355,7 @@ class JointEKF(JointKalman):
 
 
 class JointUKF(JointKalman):
-    """Second order in the mean and no derivatives, at ``2d`` runs of the model a row.
-
-    Example:
-        >>> from avtorch import BeliefStream, GLVDPlant, Leader, simulate
-        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-        >>> rows = {"accel": run.accel[:, 0], "accel_cmd": run.accel_cmd[:, 0], "jerk": run.jerk[:, 0]}
-        >>> stream = BeliefStream(check_units=False, estimator="ukf", drift=0.02)  # made of JointUKF
-        >>> [round(w.belief.stat("K_L")["mean"], 1) for w in stream.feed(run.time, rows) + stream.flush()]
-        [0.9, 0.9]
-    """
+    """Second order in the mean and no derivatives, at ``2d`` runs of the model a row."""
 
     def predict(self, model: StateModel, state: GaussianState, row: Observation) -> GaussianState:
         points = model.advance(sigma_points(state), row)

@@ -36,20 +36,10 @@ class RecursiveLeastSquares(WindowedEstimator):
     There is no prior, so a belief needs both coefficients well above zero (``CLEAR``); until then a window counts as
     not converged: its sums are kept, the belief is carried over.
 
-    Args:
-        forgetting: in (0, 1], per row; 1 forgets nothing. The memory is ``1 / (1 - forgetting)`` rows: the default
-            remembers 200, a window of 2 s at 100 Hz.
+    `forgetting`: in (0, 1], per row; 1 forgets nothing. The memory is ``1 / (1 - forgetting)`` rows: the default
+    remembers 200, a window of 2 s at 100 Hz.
 
-    Raises:
-        InputError: where jerk is not measured, or for ``forgetting`` out of range.
-
-    Example:
-        >>> from avtorch import BeliefStream, GLVDPlant, Leader, simulate
-        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-        >>> rows = {"accel": run.accel[:, 0], "accel_cmd": run.accel_cmd[:, 0], "jerk": run.jerk[:, 0]}
-        >>> stream = BeliefStream(check_units=False, estimator="rls", forgetting=0.99)  # remembers 100 rows
-        >>> [round(w.belief.stat("T_L")["mean"], 1) for w in stream.feed(run.time, rows) + stream.flush()]
-        [0.5, 0.5]
+    Raises `InputError` where jerk is not measured, or for ``forgetting`` out of range.
     """
 
     def __init__(self, form: Form, *, forgetting: float = 0.995, **options: Any) -> None:

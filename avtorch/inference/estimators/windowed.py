@@ -20,13 +20,6 @@ class Estimator(Protocol):
     """Takes the windows of many vehicles one after another and keeps a belief about them.
 
     A window that is not excited leaves the belief of its vehicle as it was.
-
-    Example:
-        >>> from avtorch.inference import JerkForm
-        >>> from avtorch.inference.estimators import Estimator, make_estimator
-        >>> filters: list[Estimator] = [make_estimator(name, JerkForm()) for name in ("ekf", "ukf")]
-        >>> [f.belief.names for f in filters]
-        [('T_L', 'K_L', 'sigma'), ('T_L', 'K_L', 'sigma')]
     """
 
     @property
@@ -54,8 +47,7 @@ class WindowedEstimator(ABC):
         kept: draws per vehicle that a belief carries.
         device: where belief and memory are, and the rows of `take` have to be.
 
-    Raises:
-        InputError: for fewer than two draws or one vehicle, or a device that this machine lacks.
+    Raises `InputError` for fewer than two draws or one vehicle, or a device that this machine lacks.
     """
 
     def __init__(
@@ -102,9 +94,8 @@ class WindowedEstimator(ABC):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`.
 
-        Raises:
-            InputError: if it was saved by an estimator of other parameters or vehicles, or has other shapes or
-                types than it saves; nothing is then changed.
+        Raises `InputError` if it was saved by an estimator of other parameters or vehicles, or has other shapes or
+        types than it saves; nothing is then changed.
         """
         saved, own = about(state), about(self.state_dict())
         if saved != own:

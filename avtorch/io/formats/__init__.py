@@ -11,10 +11,9 @@ from collections.abc import Sequence
 
 from avtorch.errors import InputError
 from avtorch.io.formats.apart import open_apart
-from avtorch.io.formats.kinds import NEED, is_kind, kind_at
-from avtorch.io.formats.library import refuse_missing
+from avtorch.io.formats.kinds import NEED, is_kind, kind_at, refuse_missing
+from avtorch.io.formats.listed import Recording
 from avtorch.io.opening import place
-from avtorch.io.recording import Recording
 
 __all__ = ["is_recording", "open_recording"]
 

@@ -24,9 +24,8 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.io.formats.kinds import PARQUET, Kind
-from avtorch.io.formats.listed import Listed
+from avtorch.io.formats.listed import Channel, Listed
 from avtorch.io.opening import place
-from avtorch.io.recording import Channel
 
 MOST_SECONDS, SECONDS_PER_MIB = 60.0, 1.0
 """For opening, and for each reading, by the size of the file: a workbook of 20 million cells takes a third of that."""

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 from avtorch.child_process import answer, answers_to, limit_memory
 from avtorch.errors import InputError
 from avtorch.io.formats import kinds
-from avtorch.io.recording import Recording
+from avtorch.io.formats.listed import Recording
 
 MOST_MEMORY = 4 * 2**30
 """Bytes of address space, where the system can limit it: 20 million cells of a workbook take about half."""

@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from avtorch.errors import InputError, listed, printable, quoted
-from avtorch.io.formats.kinds import Kind
-from avtorch.io.formats.library import guarded, library
+from avtorch.io.formats.kinds import Kind, guarded, library
 from avtorch.io.formats.listed import Listed, Piece, topic_recording
 from avtorch.io.opening import place
 

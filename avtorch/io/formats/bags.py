@@ -12,8 +12,7 @@ from typing import Any
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.formats import kinds
 from avtorch.io.formats.bag_types import LAYOUTS
-from avtorch.io.formats.kinds import Kind
-from avtorch.io.formats.library import guarded, library
+from avtorch.io.formats.kinds import Kind, guarded, library
 from avtorch.io.formats.listed import Listed, Piece, topic_recording
 from avtorch.io.opening import place
 

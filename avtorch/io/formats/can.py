@@ -14,11 +14,9 @@ import numpy as np
 
 from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats import kinds
-from avtorch.io.formats.kinds import Kind
-from avtorch.io.formats.library import guarded, library, reason
-from avtorch.io.formats.listed import Listed
+from avtorch.io.formats.kinds import Kind, guarded, library, reason
+from avtorch.io.formats.listed import Channel, Listed
 from avtorch.io.opening import MOST_BYTES, place, read_regular
-from avtorch.io.recording import Channel
 
 _NEED = "an undamaged BLF, ASC or candump log"
 _NEED_DBC = "a DBC database"

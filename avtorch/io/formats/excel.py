@@ -19,12 +19,10 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
-from avtorch.io.formats.kinds import Kind
-from avtorch.io.formats.library import guarded, library
-from avtorch.io.formats.listed import Listed, refuse_cells
+from avtorch.io.formats.kinds import Kind, guarded, library
+from avtorch.io.formats.listed import Channel, Listed, refuse_cells
 from avtorch.io.formats.matlab import FINER, TIMES
 from avtorch.io.opening import MOST_BYTES, MOST_COLUMNS, place, read_regular
-from avtorch.io.recording import Channel
 
 _NEED = "an undamaged workbook"
 _SCALES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}

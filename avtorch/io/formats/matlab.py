@@ -18,11 +18,9 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats import kinds
-from avtorch.io.formats.kinds import Kind
-from avtorch.io.formats.library import guarded, library, reason
-from avtorch.io.formats.listed import Listed, refuse_cells
+from avtorch.io.formats.kinds import Kind, guarded, library, reason
+from avtorch.io.formats.listed import Channel, Listed, refuse_cells
 from avtorch.io.opening import MOST_COLUMNS, opened, place
-from avtorch.io.recording import Channel
 
 TIMES = ("time", "t", "timestamp", "timestamps", "time_s", "t_s", "tout", "seconds", "elapsed", "sec")
 """Names of a time vector in seconds, in the order in which they are tried; capitals do not matter."""

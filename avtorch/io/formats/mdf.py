@@ -12,11 +12,9 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, quoted
-from avtorch.io.formats.kinds import Kind
-from avtorch.io.formats.library import guarded, library
-from avtorch.io.formats.listed import Listed, refuse_cells
+from avtorch.io.formats.kinds import Kind, guarded, library
+from avtorch.io.formats.listed import Channel, Listed, refuse_cells
 from avtorch.io.opening import MOST_BYTES, beginning, opened, place, read_regular
-from avtorch.io.recording import Channel
 
 _NEED = "an undamaged MDF 3 or 4 file"
 _NUMBERS_4 = frozenset(range(6))  # unsigned, signed and real, little and big end first; then texts, bytes, media

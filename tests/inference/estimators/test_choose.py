@@ -13,7 +13,7 @@ from avtorch.errors import InputError
 from avtorch.inference import BeliefStream, SamplerSettings
 from avtorch.inference.estimators import ESTIMATORS, make_estimator
 from avtorch.inference.form import JerkForm
-from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.latent import LatentForm
 from avtorch.vehicle import ClosedLoop, GLVDPlant, Leader
 from tests.bars import BAR
 

@@ -12,9 +12,7 @@ from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, JerkForm, integrate
 from avtorch.inference.estimators import JointEKF, JointUKF
 from avtorch.inference.estimators.kalman import GaussianState, JerkState, LatentState, Observation
-from avtorch.inference.latent import FINEST, LatentDensity
-from avtorch.inference.latent_form import LatentForm
-from avtorch.inference.latent_window import LatentWindow
+from avtorch.inference.latent import FINEST, LatentDensity, LatentForm, LatentWindow
 from avtorch.inference.priors import Joint, LogNormalPrior, default_jerk_noise_prior
 from avtorch.vehicle.glvd import glvd_jerk
 from tests.bars import BAR

@@ -11,7 +11,7 @@ import torch
 from avtorch.errors import InputError
 from avtorch.inference import BeliefStream, JerkForm
 from avtorch.inference.estimators import RecursiveLeastSquares
-from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.latent import LatentForm
 from tests.bars import BAR
 
 F64 = torch.float64

@@ -17,7 +17,7 @@ from avtorch.child_process import limit_memory
 from avtorch.errors import InputError
 from avtorch.io.formats import apart_process, open_recording
 from avtorch.io.formats.kinds import kind_at
-from avtorch.io.recording import Channel, Recording
+from avtorch.io.formats.listed import Channel, Recording
 from tests.damage import KINDS, damaged
 
 LATE_S = 20

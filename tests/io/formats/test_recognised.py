@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from avtorch.errors import InputError
-from avtorch.io.formats import is_recording, kinds, library, open_recording
+from avtorch.io.formats import is_recording, kinds, open_recording
 from avtorch.io.formats.presets import PRESETS
 from avtorch.io.mapping import SIGNALS
 
@@ -129,7 +129,7 @@ def test_a_library_that_lacks_a_part_of_its_own_is_another_fault(monkeypatch: py
 
     monkeypatch.setattr(importlib, "import_module", broken)
     with pytest.raises(InputError, match=r"which cannot be loaded here .*lxml.*--force-reinstall 'avtorch\[mdf\]'"):
-        library.library("asammdf", "drive.mf4", kinds.MDF)
+        kinds.library("asammdf", "drive.mf4", kinds.MDF)
 
 
 def test_looking_at_a_file_loads_no_library(tmp_path: Path) -> None:

@@ -1,7 +1,11 @@
-"""How a table is written: its separator, its decimal mark, and which lines are comments, header and units.
+"""Text tables as recorders and spreadsheets write them: encoding, separator, decimal mark, comments, header and units,
+and times such as `2024-09-16T10:02:28.125+02:00`.
 
 A log is a table of numbers, so the separator is the one that makes numbers and times of its cells. clevercsv, which
 judges tables of any content, takes the comma where spaces separate decimal commas, and a second to be imported.
+
+A statistical guess at the code page does worse than a fixed one: charset-normalizer 3.5 named seven of ten headers with
+m/s², ° or an umlaut wrongly. So text that is not Unicode is read as Windows-1252, and that is told.
 """
 
 from __future__ import annotations
@@ -9,13 +13,205 @@ from __future__ import annotations
 import csv
 import io
 import re
+import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import lru_cache
+from zoneinfo import ZoneInfo
 
+import numpy as np
+
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.io.text.time_stamps import is_time
+from avtorch.io.opening import MOST_BYTES
 from avtorch.numeral import numeral
+
+_DAY_S = 86_400.0
+_STAMP = re.compile(
+    r"\s*(?:(?P<a>\d{1,4})(?P<mark>[-/.])(?P<b>\d{1,2})(?P=mark)(?P<c>\d{1,4})[T\s_]+)?"
+    r"(?P<h>\d{1,2}):(?P<m>\d{2}):(?P<s>\d{2})(?:[.,:](?P<fraction>\d{1,12}))?"
+    r"\s*(?P<half>[AaPp][Mm])?\s*(?P<zone>Z|[+-]\d{2}:?\d{2}|[A-Za-z][A-Za-z_]*(?:/[A-Za-z_]+)*)?\s*"
+)
+_TEXT = 100  # characters of the longest
+
+
+def is_time(cell: str) -> bool:
+    """Whether a cell is a time of day, with or without a date."""
+    return len(cell) <= _TEXT and _STAMP.fullmatch(cell) is not None
+
+
+def seconds_of(cells: Sequence[str]) -> tuple[FloatArray, tuple[str, ...]]:
+    """Seconds (cell,) of times as text, NaN where a cell is none, and remarks on what was assumed.
+
+    With a date they count from 1970, in UTC where a zone is stated (`Z`, an offset, `UTC`, or a name such as
+    `Europe/Berlin`); without one from midnight, and go on counting over the next.
+    """
+    stamps = [_STAMP.fullmatch(cell) if len(cell) <= _TEXT else None for cell in cells]
+    remarks: list[str] = []
+    order = _order(stamps, remarks)
+    out = np.full(len(cells), np.nan)
+    unknown: set[str] = set()
+    for row, stamp in enumerate(stamps):
+        if stamp is None:
+            continue
+        clock = _clock(stamp)
+        day = 0.0 if stamp["a"] is None else _day(stamp["a"], stamp["b"], stamp["c"], order)
+        if clock is None or day is None:
+            continue
+        ahead = _ahead(stamp["zone"], day + clock)
+        if ahead is None:
+            unknown.add(stamp["zone"])
+        out[row] = day + clock - (ahead or 0.0)
+    if unknown:
+        remarks.append(f"time zone {', '.join(sorted(unknown)[:3])} is not known and was not applied")
+    if all(stamp is None or stamp["a"] is None for stamp in stamps):
+        _over_midnight(out)
+    return out, tuple(remarks)
+
+
+def _clock(stamp: re.Match[str]) -> float | None:
+    hours, minutes, seconds = int(stamp["h"]), int(stamp["m"]), int(stamp["s"])
+    if stamp["half"]:
+        if not 1 <= hours <= 12:
+            return None
+        hours = hours % 12 + (12 if stamp["half"].lower() == "pm" else 0)
+    if hours > 24 or minutes > 59 or seconds > 60:
+        return None
+    fraction = float(f"0.{stamp['fraction']}") if stamp["fraction"] else 0.0
+    return 3600.0 * hours + 60.0 * minutes + seconds + fraction
+
+
+def _order(stamps: Sequence[re.Match[str] | None], remarks: list[str]) -> str:
+    """`ymd`, `dmy` or `mdy`; a point between the numbers is written day first."""
+    dated = [stamp for stamp in stamps if stamp is not None and stamp["a"] is not None]
+    if not dated or len(dated[0]["a"]) == 4:
+        return "ymd"
+    if any(int(stamp["a"]) > 12 for stamp in dated) or dated[0]["mark"] == ".":
+        return "dmy"
+    if any(int(stamp["b"]) > 12 for stamp in dated) or dated[0]["half"]:
+        return "mdy"
+    remarks.append(f"the date {dated[0]['a']}/{dated[0]['b']}/{dated[0]['c']} is read month first")
+    return "mdy"
+
+
+@lru_cache(maxsize=64)
+def _day(a: str, b: str, c: str, order: str) -> float | None:
+    """Seconds from 1970 to the beginning of a day."""
+    numbers = dict(zip(order, (int(a), int(b), int(c)), strict=True))
+    try:
+        return datetime(numbers["y"], numbers["m"], numbers["d"], tzinfo=UTC).timestamp()
+    except ValueError:
+        return None
+
+
+def _ahead(zone: str | None, stamp: float) -> float | None:
+    """Seconds that a zone's clock is ahead of UTC; None for an unknown one."""
+    if zone is None or zone.upper() in ("Z", "UTC", "GMT"):
+        return 0.0
+    if zone[0] in "+-":
+        size = 3600.0 * int(zone[1:3]) + 60.0 * int(zone[-2:])
+        return size if zone[0] == "+" else -size
+    return _ahead_there(zone, int(stamp // 900))
+
+
+@lru_cache(maxsize=256)
+def _ahead_there(zone: str, quarter: int) -> float | None:
+    try:
+        there = ZoneInfo(zone)
+    except (ValueError, OSError, LookupError):
+        return None
+    local = datetime.fromtimestamp(900.0 * quarter, UTC).replace(tzinfo=there)
+    ahead = local.utcoffset()
+    return None if ahead is None else ahead.total_seconds()
+
+
+def _over_midnight(seconds: FloatArray) -> None:
+    """Counts on where a clock of hours begins anew."""
+    known = np.flatnonzero(np.isfinite(seconds))
+    backwards = np.diff(seconds[known]) < -_DAY_S / 2
+    seconds[known[1:]] += _DAY_S * np.cumsum(backwards)
+
+
+_BINARY = re.compile(rb"[\x00-\x08\x0b\x0e-\x1a\x1c-\x1f]")
+_PIECE = 2**20
+
+
+def unzipped(source: str, raw: bytes) -> bytes:
+    """`raw`, or what it holds if it is gzip. Raises InputError for a damaged one, and beyond `MOST_BYTES`."""
+    if not raw.startswith(b"\x1f\x8b"):
+        return raw
+    pieces, size, rest = [], 0, raw
+    try:
+        while rest.startswith(b"\x1f\x8b"):  # several may follow each other
+            part = zlib.decompressobj(wbits=31)
+            while not part.eof:
+                piece = part.decompress(rest, _PIECE)
+                rest = part.unconsumed_tail
+                pieces.append(piece)
+                size += len(piece)
+                if size > MOST_BYTES:
+                    raise InputError(f"{source}: holds over {MOST_BYTES:,} bytes; {MOST_BYTES:,} at most are needed")
+                if not piece and not rest and not part.eof:
+                    raise InputError(f"{source}: ends inside its gzip data; the whole file is needed")
+            rest = part.unused_data
+    except zlib.error:
+        raise InputError(f"{source}: damaged gzip data; write the file anew") from None
+    return b"".join(pieces)
+
+
+def decoded(source: str, raw: bytes) -> tuple[str, tuple[str, ...]]:
+    """Text, and a remark on its encoding where that had to be guessed. Raises InputError for what is no text."""
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return _utf16(source, raw, "utf-16"), ()
+    silent = _silent_utf16(raw)
+    if silent is not None:
+        return _utf16(source, raw, silent), ()
+    if b"\0" in raw:
+        line = _line(raw[: raw.index(b"\0")])
+        raise InputError(f"{source}: line {line}: holds a zero byte, so it is binary; {_NEEDED}")
+    try:
+        return raw.decode("utf-8-sig"), ()
+    except UnicodeDecodeError as fault:
+        # after a byte order mark the codec counts from behind it
+        start = fault.start + (3 if raw.startswith(b"\xef\xbb\xbf") and len(fault.object) < len(raw) else 0)
+    odd = _BINARY.search(raw)
+    try:
+        if odd is None:
+            text = raw.decode("cp1252")
+            remark = f"line {_line(raw[:start])} is not UTF-8: the text is read as Windows-1252 (Latin-1)"
+            return text, (remark,)
+    except UnicodeDecodeError:
+        pass
+    raise InputError(f"{source}: line {_line(raw[:start])}, byte {start + 1}: is not UTF-8 text; {_NEEDED}")
+
+
+_NEEDED = "a CSV or Parquet file is needed"
+
+
+def _silent_utf16(raw: bytes) -> str | None:
+    """The byte order of UTF-16 without a mark: ASCII in it has a zero in every other byte, and nowhere else."""
+    head = raw[:1000]
+    for codec, zero, other in (("utf-16-le", head[1::2], head[::2]), ("utf-16-be", head[::2], head[1::2])):
+        if len(zero) >= 4 and zero.count(0) > 0.7 * len(zero) and 0 not in other:
+            return codec
+    return None
+
+
+def _utf16(source: str, raw: bytes, codec: str) -> str:
+    try:
+        text = raw.decode(codec)
+    except UnicodeDecodeError as fault:
+        raise InputError(f"{source}: byte {fault.start + 1}: is not UTF-16 text; {_NEEDED}") from None
+    if "\0" in text:
+        raise InputError(f"{source}: holds a zero character, so it is binary; {_NEEDED}")
+    return text
+
+
+def _line(before: bytes) -> int:
+    return len(re.findall(rb"\r\n|\r|\n", before)) + 1
+
 
 COMMENT = ("#", "//", "%")
 """What a line of comment begins with."""

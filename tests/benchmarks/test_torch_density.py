@@ -8,8 +8,9 @@ from torch.distributions import Beta, Gamma, Normal
 from torch.distributions.constraints import interval, positive, real, simplex, unit_interval
 
 from avtorch.errors import InputError
-from avtorch.inference import SamplerSettings, TorchDensity, sample
+from avtorch.inference import SamplerSettings, sample
 from avtorch.inference.density import ConstrainedDensity, Density
+from benchmarks.torch_density import TorchDensity
 from tests.bars import BAR
 
 F64 = torch.float64

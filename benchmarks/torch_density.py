@@ -1,4 +1,4 @@
-"""Any log density written in torch as a target, also for posteriors unrelated to vehicles."""
+"""Any log density written in torch as a target of the sampler: posteriors that have nothing to do with vehicles."""
 
 from __future__ import annotations
 
@@ -30,18 +30,8 @@ class TorchDensity:
             default.
         device: where ``log_density`` computes.
 
-    Raises:
-        InputError: for no parameters, a constraint that is not of a single number, a start that breaks one, or a
-            device that this machine lacks.
-
-    Example:
-        >>> import torch
-        >>> from torch.distributions import Gamma, constraints
-        >>> from avtorch.inference import TorchDensity, sample
-        >>> rate = TorchDensity(lambda p: Gamma(3.0, 2.0).log_prob(p["rate"]), {"rate": constraints.positive})
-        >>> posterior = sample(rate, generator=torch.Generator().manual_seed(0))
-        >>> posterior.converged.item(), round(posterior.mean.item(), 1)  # 3/2
-        (True, 1.5)
+    Raises `InputError` for no parameters, a constraint that is not of a single number, a start that breaks one, or a
+    device that this machine lacks.
     """
 
     windows = 1

@@ -1,1 +1,0 @@
-"""Text as recorders and spreadsheets write it: its encoding, its layout, its clocks."""
