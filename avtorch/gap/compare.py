@@ -220,16 +220,18 @@ def _by_rows(record: Record, base: GapPlant, blocks: Sequence[slice]) -> tuple[F
                 e[k, record.starts] = 0.0
         return e
 
-    z, step = np.log([float(base.T_L), float(base.K_L)]), 1e-3
-    information, scores = np.eye(2), np.zeros((2, record.rows))
+    z: FloatArray = np.log([float(base.T_L), float(base.K_L)])
+    information: FloatArray = np.eye(2)
+    scores: FloatArray = np.zeros((2, record.rows))
+    step = 1e-3
     for _ in range(_TURNS):
         e = errors(z)
-        weight = np.linalg.inv(e @ e.T / e.shape[1])
+        weight = np.asarray(np.linalg.inv(e @ e.T / e.shape[1]), np.float64)
         J = np.stack([(e - errors(z + step * unit)) / step for unit in np.eye(2)])
         weighted = np.einsum("pct,cd->pdt", J, weight)
         information = np.einsum("pdt,qdt->pq", weighted, J) + np.eye(2)
         scores = np.einsum("pdt,dt->pt", weighted, e)
-        z = z + np.clip(np.linalg.solve(information, scores.sum(1)), -0.5, 0.5)
+        z = z + np.clip(np.asarray(np.linalg.solve(information, scores.sum(1)), np.float64), -0.5, 0.5)
     return z, information, np.stack([scores[:, b].sum(1) for b in blocks], 1)
 
 
