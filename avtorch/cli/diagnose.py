@@ -35,7 +35,7 @@ from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.simulators import read_simulator, refuse_loop, simulator_of
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError, quoted
-from avtorch.gap.result.alarm import Alarm
+from avtorch.gap.result.traces import Alarm
 from avtorch.io import Log
 from avtorch.io.opening import place, read_regular
 from avtorch.numeral import numeral

@@ -182,7 +182,7 @@ def _ranks(chosen: ChosenWindows) -> Table:
         for i, name in enumerate(chosen.validation.names):
             drawn = chosen.groups(row, i)
             others = {g: np.concatenate([x for other, x in drawn.items() if other != g]) for g in drawn}
-            found = (f"{ks_2samp(drawn[g], others[g]).pvalue:.2g}" if g in drawn else "" for g in groups)
+            found = (f"{ks_2samp(drawn[g], others[g])[1]:.2g}" if g in drawn else "" for g in groups)
             rows.append((f"{window.number}: {name}", *found))
     columns = ("window and parameter", *groups)
     return Table("p-value of each group beside the others (Kolmogorov-Smirnov)", columns, tuple(rows), columns[1:])

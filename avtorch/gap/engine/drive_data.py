@@ -26,7 +26,7 @@ from avtorch.gap.drive_record import same_kind
 from avtorch.gap.engine.compiled_plant import GRID_S
 from avtorch.gap.engine.priors import BAND_RATIO, CLAIM_HZ, FRAME_S, WARM_S
 from avtorch.io import Log
-from avtorch.io.log import AccelKind, no_command
+from avtorch.io.log import AccelKind
 
 _MOST_HZ = 100.0  # rows of faster logs are averaged: nothing above half of it is a car's
 _SMOOTH_S = 0.3  # the speed enters effects smoothed over it
