@@ -75,8 +75,8 @@ plots.show(over_diagnosis.which_figure(found), OUT / "which.png")
 plots.show(over_diagnosis.road_figure(found), OUT / "road.png")
 
 # %% [markdown]
-# The stretch where the simulators with the likeliest hypothesis (blue) and without it (orange) differ most, and the
-# measurement.
+# The stretch that tells most, as measured and by the baseline simulator. With a cause named, the simulator with that
+# cause would be drawn as well.
 #
 # ## The next experiment
 #
