@@ -71,7 +71,7 @@ print(f"neutral against none: {error:.1e} m/s²; bent against none: {float((bent
 # %% [markdown]
 # ## The effect diagnosed
 #
-# A minute of driving with it. Then the diagnosis, with the class as one more hypothesis beside the 22.
+# A minute of driving with it. Then the diagnosis, with the class as one more hypothesis beside the 24.
 
 # %%
 car = plant([PedalMap(0.4)], baseline="T_L=0.4, K_L=0.9", sigma=0.1)
@@ -88,8 +88,9 @@ for what, answer in (("this minute", quiet), ("a livelier one", without)):
     print(f"without the class, {what}:", answer.verdict.name, f"{answer.winner.probability:.2f}")
 
 # %% [markdown]
-# With the class among the hypotheses the diagnosis names the effect and its size. Without it it cannot, and says so:
-# the verdict is `unknown`, a cause that is not in the table, in this minute and in a livelier one of the same car.
+# With the class among the hypotheses the diagnosis names the effect and its size. Without it it cannot. In this minute
+# it says so: the verdict is `unknown`, a cause that is not in the table. In a livelier one of the same car it blames
+# the road, which is wrong: what a table lacks can look like what it has.
 #
 # `@register` above the class would make it available everywhere: in strings, in TOML files, in every diagnosis.
 #

@@ -100,7 +100,7 @@ print(f"after {log.elapsed[-1]:.0f} s the simulator is {drift:.0f} m/s faster th
 
 # %% [markdown]
 # The accelerations look alike; the speeds drift apart. It is tempting to refit lag and gain until they do not. On this
-# drive that gives a lag of 1.2 s and a gain of 1.2: a simulator that is wrong in two more ways.
+# drive that gives a lag of 0.9 s and a gain of 1.1: a simulator that is wrong in two more ways.
 #
 # ## What does it lack, and how much is each worth?
 #

@@ -114,24 +114,22 @@ def a_drive_watched_and_saved(names: Names) -> None:
 
 
 def diagnosing_a_gap(names: Names) -> None:
-    found, both = names["found"], names["both"]
-    shrinkage = found.shrinkage
-    assert shrinkage is not None
-    assert len(found.verdict.alias_set) > 1
+    found, both, (true,) = names["found"], names["both"], names["case"].names
+    assert found.verdict.name == "unknown"
+    assert true in found.verdict.alias_set
     assert names["ahead"] is not None
-    assert both.verdict.alias_set == (names["case"].truth_name,)
+    assert both.verdict.names == (true,)
+    shrinkage = both.shrinkage
+    assert shrinkage is not None
     assert shrinkage.top.after < shrinkage.top.before
-    assert shrinkage.ceiling[shrinkage.metric] > shrinkage.top.before
-    assert {w.axis for w in found.where} == {"signal", "frequency"}
-    assert next(w for w in found.where if w.axis == "signal").begin == "actuation"
     assert both.plant is not None
 
 
 def your_own(names: Names) -> None:
     assert names["error"] == 0.0
     assert names["found"].verdict.name == "pedal_map"
-    assert names["quiet"].verdict.name == "none"
-    assert names["without"].verdict.name not in ("none", "pedal_map")  # a stand-in
+    assert names["quiet"].verdict.name == "unknown"
+    assert names["without"].verdict.name == "road_grade"
     peaks = [
         names["avtorch"].stability.peak_gain(T, K, names["time_gap"], names["gains"]) for T, K in ((0.3, 1), (1.5, 0.5))
     ]
@@ -145,8 +143,8 @@ def your_own(names: Names) -> None:
 def your_simulator(names: Names) -> None:
     assert names["check"].values["dead_time.delay_s"] == pytest.approx(0.1, abs=0.01)
     assert names["check"].values["second_order_actuator.natural_frequency_radps"] == pytest.approx(6.0, rel=0.03)
-    assert names["found"].verdict.name == "constant_resistance"
-    assert names["found"].tested.missing == ("constant_resistance",)
+    assert names["found"].verdict.alias_set == ("dead_band", "constant_resistance")
+    assert names["found"].tested.missing == ("dead_band",)
     assert names["errors"]["wrapped"] < 0.1 * names["errors"]["as it was"]
 
 
@@ -155,8 +153,8 @@ def log_to_repaired_simulator(names: Names) -> None:
     proposal = names["found_in_log"].proposal
     assert proposal.map == {"time": "t_ms", "accel_cmd": "AccReq_mps2", "accel": "IMU_Ax_g", "speed": "VehSpd_kph"}
     assert names["drift"] > 10
-    assert found.baseline["T_L"].mean == pytest.approx(1.2, abs=0.1)  # lag and gain alone, refitted
-    assert found.baseline["K_L"].mean == pytest.approx(1.2, abs=0.1)
+    assert found.baseline["T_L"].mean == pytest.approx(0.9, abs=0.05)  # lag and gain alone, refitted
+    assert found.baseline["K_L"].mean == pytest.approx(1.1, abs=0.05)
     shares = {part.name: part.share.mean for part in found.budget.parts}
     assert set(shares) == set(names["LACKS"])
     assert shares["constant_resistance"] > 0.9
@@ -198,7 +196,7 @@ def test_runs_without_recordings(path: Path, run: Callable, monkeypatch: pytest.
 def test_real_cars_with_recordings(data_dir: Path, run: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AVTORCH_DATA", str(data_dir))
     names, pictures = run(REAL_CARS)
-    assert len(pictures) == 3
+    assert len(pictures) == 2
     assert len(names["cars"]) == 4
     for car in names["cars"]:
         own = car.loops[car.law.name]
@@ -207,14 +205,7 @@ def test_real_cars_with_recordings(data_dir: Path, run: Callable, monkeypatch: p
         assert own.amplified_simulated == pytest.approx(own.amplified, rel=0.05)
         assert car.usual.peak_gain.q05 > 1
         assert 1.0 < car.parameters["headway_s"].mean < 1.3
-    # held-out blocks decide, as the likelihood does not hold
-    assert names["as_it_is"].verdict.name != "none"
-    assert names["as_it_is"].budget is not None
-    assert names["named"].verdict.name == "brake_throttle_asymmetry"
-    assert names["named"].winner.parameters["brake_gain_ratio"].q05 > 1
-    by_metric = names["named"].shrinkage.by_metric
-    assert by_metric["rollout_rmse_speed"].closed.q05 > 0
-    assert by_metric["rollout_rmse_speed_whole"].closed.q05 < 0
+    assert names["as_it_is"].verdict.name == names["named"].verdict.name == "none"
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
