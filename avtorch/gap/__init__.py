@@ -38,6 +38,7 @@ from avtorch.gap.effects import (
     SensorScale,
     SpeedDependentGain,
     SpeedDependentLag,
+    SpeedSensorLag,
     ViscousDrag,
 )
 from avtorch.gap.simulator.domain import Domain
@@ -94,6 +95,7 @@ __all__ = [
     "SimulatorInput",
     "SpeedDependentGain",
     "SpeedDependentLag",
+    "SpeedSensorLag",
     "Unexplained",
     "ViscousDrag",
     "effect_class",
