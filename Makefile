@@ -8,7 +8,8 @@ JOBS ?= 2
 # PyTorch's own index of CPU builds: on Linux the default build brings some 3 GB of CUDA libraries that avtorch does not
 # need. Where it cannot be reached pip warns and takes the default build. `make demo TORCH_INDEX=...` names another one.
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
-PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
+# pip would compile 18,000 files, of which most are never imported; an import compiles its own.
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile --constraint constraints.txt
 
 # One thread per process: the tests run in parallel, and small tensors gain nothing from more.
 export OMP_NUM_THREADS ?= 1

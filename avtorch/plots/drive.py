@@ -209,7 +209,7 @@ def diagnosis_figure(found: Diagnosis) -> Figure:
         >>> from avtorch import Leader, diagnose, plots, simulate
         >>> from avtorch.gap import ConstantResistance, plant
         >>> car = plant([ConstantResistance(0.3)], sigma=0.02)
-        >>> log = simulate(Leader.default(start=30.0, duration=40.0, dt=0.1), plant=car).log()
+        >>> log = simulate(Leader.default(start=30.0, duration=100.0, dt=0.1), plant=car).log()
         >>> figure = plots.diagnosis_figure(diagnose(log, effects=["constant_resistance"], pairs=False))
         >>> [ax.get_xlabel() or ax.get_ylabel() for ax in figure.axes]
         ['share of the gap in held-out 10 s rollouts', 'acceleration [m/s²]', 'time [s]']

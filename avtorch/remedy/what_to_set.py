@@ -188,7 +188,7 @@ def setting_for(
         >>> from avtorch.gap import DeadTime, plant
         >>> from avtorch.remedy import setting_for
         >>> late = plant([DeadTime(0.4)], sigma=0.0)
-        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
+        >>> log = simulate(Leader.default(start=50.0, duration=30.0, dt=0.1), plant=late).log()
         >>> answer = setting_for(diagnose(log, effects=["dead_time"], pairs=False), log.accel_cmd)
         >>> round(answer.p_now, 2), answer.sufficient
         (0.0, True)

@@ -27,6 +27,8 @@ import avtorch.plots.style
 import avtorch.report
 import avtorch.report.comparison
 import avtorch.report.diagnosis
+import avtorch.report.estimates
+import avtorch.report.run
 import avtorch.report.validation
 import avtorch.results
 import avtorch.validation
@@ -84,12 +86,14 @@ def run(c: Command) -> None:
     c.lines = {"old": [*line, "--seed", "1"], "new": [*line, "--seed", "2"]}
     c.once(avtorch.vehicle.Leader, "default")
     c.once(avtorch.decision.supervisor.Supervisor, "run")
+    c.stand_in(avtorch.report.run, "run_html", lambda *_, **__: f"page of {c.of}")
 
 
 def estimate(c: Command) -> None:
     line = ["estimate", write(c.tmp_path / "drive.csv", **columns()), "--estimator", "map"]
     c.lines = {"old": line, "new": [*line, "--tau", "1.2"]}
     c.once(avtorch.decision.estimation, "estimate")
+    c.stand_in(avtorch.report.estimates, "estimates_html", lambda *_, **__: f"page of {c.of}")
 
 
 def diagnose(c: Command) -> None:

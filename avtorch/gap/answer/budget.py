@@ -183,9 +183,9 @@ class Unexplained:
             return "noise"
         low, high = (round(100 * x) for x in (self.still.q05, self.still.q95))
         if low == 0 and high == 100:
-            return "noise or not: this log is too short to tell it from what a black box may still foretell"
+            return "noise or what a black box may still foretell: this log is too short to tell"
         if high == 100:  # the log bounds it from below alone
-            return f"noise or what a black box may still foretell, {low} % of it surely"
+            return f"noise but for {low} % or more, which a black box may still foretell"
         return f"noise but for {low} to {high} %, which a black box may still foretell"
 
     def places(self, epoch_s: float = 0.0) -> str:
@@ -236,7 +236,7 @@ class Budget:
         >>> from avtorch import Leader, simulate
         >>> from avtorch.gap import ConstantResistance, gap_budget, plant
         >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
-        >>> log = simulate(Leader.default(start=30.0, duration=40.0, dt=0.1), plant=dragging).log()
+        >>> log = simulate(Leader.default(start=30.0, duration=100.0, dt=0.1), plant=dragging).log()
         >>> budget = gap_budget(log, effects=["constant_resistance"])
         >>> part = budget.parts[0]
         >>> part.name, round(part.parameters["resistance_mps2"].mean, 1), budget.verdict
