@@ -1,4 +1,5 @@
-"""What an engineer fits in an afternoon instead of a diagnosis: a pedal map behind a lag, and boosted trees.
+"""What an engineer fits in an afternoon instead of a diagnosis: a pedal map behind a lag, boosted trees, a small
+recurrent network.
 
 Each takes stretches of command, speed and acceleration, and foretells the acceleration of a free run, whose own speed
 comes back. `free_run` drives any of them, and any plant of the project, over a stretch.
@@ -17,6 +18,7 @@ from scipy.signal import lfilter
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.gap import GapPlant, plant
+from benchmarks.learned.prediction import LEARNT, UNITS, WARM, Recurrent
 
 _SMOOTH_S = 0.15  # of a speed before it is differenced
 _SETTLED_S = 2.0  # of a stretch, after which filters know their past
@@ -25,6 +27,7 @@ _LAGS_S = (0.03, 0.08, 0.15, 0.25, 0.4, 0.6, 0.9, 1.4, 2.2)
 _DELAYS_S = (0.0, 0.1, 0.2, 0.3, 0.5)
 _FOLDS = 4
 _BACK_S = (0.0, 0.1, 0.2, 0.4, 0.7, 1.1, 1.6)  # commands that trees see
+_STEPS = 200  # of training of the network
 _TREES, _RATE, _DEPTH, _BINS, _RIDGE = 150, 0.06, 4, 48, 1.0
 
 
@@ -166,6 +169,32 @@ class Trees:
         return np.stack([v, *back, *(_lagged(u[:, None], s, self.dt)[:, 0] for s in (0.3, 1.0))], 1)
 
 
+class Network:
+    """A recurrent network (`benchmarks.learned`) of command, slope and speed, fitted over free runs."""
+
+    def __init__(self, parts: Sequence[Stretch], dt: float) -> None:
+        u, a, v = (np.concatenate([getattr(p, name)[p.ok] for p in parts]) for name in ("u", "a", "v"))
+        torch.manual_seed(0)
+        spread = [float(x.std()) + 1e-6 for x in (u, a, v)]
+        self.net, self.dt = Recurrent(dt, [float(u.mean()), 0.0, float(v.mean())], spread), dt
+        drives = []
+        for p in parts:
+            moves = np.split(np.arange(len(p.u)), np.flatnonzero(np.diff(p.ok)) + 1)
+            rows = [r for r in moves if p.ok[r[0]] and len(r) > WARM + LEARNT]
+            drives += [torch.as_tensor(np.stack([p.u[r], p.v[r]], 1)).float() for r in rows]
+        self.net.fit(drives, steps=_STEPS, seed=0)
+
+    def start(self, u: float, v: float, a: float) -> None:
+        self.h, self.v = torch.zeros(1, UNITS), v
+
+    @torch.no_grad()
+    def step(self, u: float, v: float) -> float:
+        row = (torch.tensor([x]) for x in (u, (v - self.v) / self.dt, v))
+        a, self.h = self.net(*row, self.h)
+        self.v = v
+        return float(a)
+
+
 class Constant:
     """The speed stays what it was."""
 
@@ -178,6 +207,7 @@ class Constant:
 BLACK_BOXES: dict[str, Callable[[Sequence[Stretch], float], Driven]] = {
     "pedal map": PedalMap,
     "trees": Trees,
+    "GRU": Network,
     "constant": lambda parts, dt: Constant(),
 }
 """Black boxes by name, from taught stretches and the step [s]."""

@@ -93,7 +93,7 @@ class ManoeuvrePrediction:
         seen = responses(contender, manoeuvres, slice(0, draws))
         # parts that do not depend on the draw come without that dimension
         shape = (len(manoeuvres), draws, len(manoeuvres[0].time))
-        parts = {"accel": seen.accel_measured, "speed": seen.speed}
+        parts = {"accel": seen.accel_measured, "speed": seen.speed_measured}
         stacked = torch.stack([parts[name].expand(shape) for name in channels], -2).numpy()
         return cls(contender, channels, manoeuvres, stacked, group)
 

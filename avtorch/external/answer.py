@@ -40,7 +40,7 @@ def responses(drives: Log, plant: GapPlant) -> dict[str, FloatArray]:
         if rows.sum() < 2 or not drives.engaged[rows].any():  # under the driver there is no simulator
             continue
         response = plant.response(SimulatorInput.from_log(drives, segment))
-        answers = {"accel": response.accel_measured, "speed": response.speed}
+        answers = {"accel": response.accel_measured, "speed": response.speed_measured}
         for name, values in found.items():
             values[rows] = answers[name].numpy()
     return found

@@ -35,6 +35,7 @@ from avtorch.gap.effects import (
     SensorScale,
     SpeedDependentGain,
     SpeedDependentLag,
+    SpeedSensorLag,
     ViscousDrag,
 )
 from avtorch.gap.simulator.domain import Domain
@@ -84,6 +85,7 @@ __all__ = [
     "SimulatorInput",
     "SpeedDependentGain",
     "SpeedDependentLag",
+    "SpeedSensorLag",
     "ViscousDrag",
     "effect_class",
     "effects",

@@ -97,5 +97,5 @@ def reached(record: MeasuredRows, horizon: float) -> float:
 def rolled_out(record: Record, simulator: GapPlant) -> FloatArray:
     """Rollouts (channel, counted, group) of a simulator over the whole drives of a record."""
     responses = [simulator.response(drive) for drive in record.drives]
-    channels = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
+    channels = {"accel": [r.accel_measured for r in responses], "speed": [r.speed_measured for r in responses]}
     return np.stack([record.at_counted_rows(channels[name]) for name in record.channels])

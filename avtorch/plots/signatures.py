@@ -50,7 +50,8 @@ def standard_response(effect: Effect | None, *, seed: int = _SEED) -> Response:
 
 
 def effect_signature(ax: Axes, effect: Effect, *, seed: int = _SEED) -> Axes:
-    """Plot the measured acceleration [m/s²] with `effect` and without, over the standard command.
+    """Plot the measured acceleration [m/s²], of an effect on the speed that speed's slope, with `effect` and without,
+    over the standard command.
 
     Below them lies the gap, magnified by the factor that is written there.
 
@@ -63,8 +64,7 @@ def effect_signature(ax: Axes, effect: Effect, *, seed: int = _SEED) -> Axes:
         True
     """
     time, command = standard_command()
-    with_it = standard_response(effect, seed=seed).accel_measured
-    without = standard_response(None).accel_measured
+    with_it, without = (_shown(standard_response(e, seed=seed), effect.reading) for e in (effect, None))
     gap = with_it - without
     factor = next((f for f in _FACTORS if f * float(gap.abs().max()) >= 0.45), _FACTORS[-1])
     ax.step(time, command, where="post", color=GREY, linewidth=0.8, alpha=0.7, label="command")
@@ -80,6 +80,10 @@ def effect_signature(ax: Axes, effect: Effect, *, seed: int = _SEED) -> Axes:
     ax.set_ylim(_GAP_AT - 1.5, 2.0)
     ax.set_yticks([-2, -1, 0, 1])
     return ax
+
+
+def _shown(response: Response, reading: str) -> Tensor:
+    return response.accel_measured if reading == "accel" else torch.gradient(response.speed_measured, spacing=_DT)[0]
 
 
 def _typical(kind: type[Effect]) -> Effect:

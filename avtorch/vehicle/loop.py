@@ -198,6 +198,7 @@ class ClosedLoop:
         lead = [s[..., span].unbind(-1) for s in (self.leader.position, self.leader.speed, self.leader.accel)]
         plant, lower = self.plant, self.lower_level
         move = cast(PlantFunction, getattr(plant, "step", plant))
+        read = getattr(plant, "speed_reading", None)
         sigma = tensor(getattr(plant, "sigma", 0.0))
         noise = self._noise.steps(first, steps)
         eps_all = sigma * _time_first(noise, max(noise.dim(), sigma.dim() + 1))
@@ -219,10 +220,11 @@ class ClosedLoop:
             spacing = lead_x - x
             time = (first + i) * dt
             seen = lead_a if self._link_steps == 0 else self._through_link(lead_a)
-            demanded = self.controller(FollowerState(time, spacing, v, kinematic, lead_v, seen))
+            shown = v if read is None else read(a, v)
+            demanded = self.controller(FollowerState(time, spacing, shown, kinematic, lead_v, seen))
             raw = lower.raw_command(kinematic, demanded)
             command = lower.clip(raw)
-            rows.append((command, kinematic, v, spacing, lead_v, lead_a, demanded, raw, a))
+            rows.append((command, kinematic, shown, spacing, lead_v, lead_a, demanded, raw, a))
             a, v_next, moved = move(a, v, command, dt, eps[i])
             stood, standing = standing, float(v_next.min()) <= 0
             if stood or standing:

@@ -1,9 +1,10 @@
 """The plant: the car's response to the command over one step.
 
 A plant is an object with `step(a, v, u, dt, eps)` (or a callable of the same arguments) that returns acceleration,
-speed and displacement after `dt`; (..., scenario) tensors, no standstill logic. Two optional members: `sigma`
-[m/s³], the scale of the jerk noise the loop draws for it (none: 0), and `jerk(a, u)`, the noise-free jerk at a row,
-without which the log's jerk is unknown (NaN), never a difference of accelerations.
+speed and displacement after `dt`; (..., scenario) tensors, no standstill logic. Three optional members: `sigma`
+[m/s³], the scale of the jerk noise the loop draws for it (none: 0); `jerk(a, u)`, the noise-free jerk at a row,
+without which the log's jerk is unknown (NaN), never a difference of accelerations; and `speed_reading(a, v)`, what
+controller and log see of the speed (none: `v`).
 """
 
 from __future__ import annotations

@@ -225,10 +225,11 @@ EFFECTS: dict[str, Family] = {
         Family("sensor_lag", "sensor", _fixed(lag_s=0.2), 5.0),
         Family("sensor_bias", "sensor", _bias, 5.0),
         Family("sensor_scale", "sensor", _scale, 3.5),
+        Family("speed_lag", "sensor", _fixed(lag_s=0.3), 3.0),
         Family("outliers", "sensor", _outliers, 6.0, by_chance=True),
     )
 }
-"""The 24 effects of the table, by name.
+"""The 25 effects of the table, by name.
 
 Example:
     >>> from benchmarks.blindtest import EFFECTS

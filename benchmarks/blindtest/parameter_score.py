@@ -33,6 +33,7 @@ SAME: Mapping[str, tuple[str, float, Callable[[float, float, float], float | Non
     "second_order_actuator": ("natural_frequency_radps", math.inf, _quotient),
     "hand_over": ("pause_s", 0.0, _quotient),
     "viscous_drag": ("drag_per_s", 0.0, _quotient),
+    "speed_lag": ("lag_s", 0.0, _quotient),
     "rate_limit": ("jerk_max_mps3", math.inf, _quotient),
     "driveline_oscillation": ("amplitude", 0.0, _quotient),
 }

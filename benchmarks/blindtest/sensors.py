@@ -15,9 +15,9 @@ from benchmarks.blindtest.command import Parameters
 Filter = Callable[[float], float]
 
 
-def filters(effects: Parameters, start: float) -> list[Filter]:
-    """Filters of the accelerometer that run every millisecond, `filter(acceleration) -> acceleration` [m/s²]."""
-    return [make(effects[name], start) for name, make in _FILTERS.items() if name in effects]
+def filters(effects: Parameters, start: float, *, speed: bool = False) -> list[Filter]:
+    """Filters of the accelerometer [m/s²], or of the `speed` [m/s], that run every millisecond: reading of reading."""
+    return [make(effects[name], start) for name, make in (_OF_SPEED if speed else _FILTERS).items() if name in effects]
 
 
 def _lag(p: Mapping[str, float], start: float) -> Filter:
@@ -49,6 +49,7 @@ def _pitch(p: Mapping[str, float], start: float) -> Filter:
 
 
 _FILTERS = {"pitch_coupling": _pitch, "sensor_lag": _lag}
+_OF_SPEED = {"speed_lag": _lag}
 
 
 class Readings:

@@ -43,9 +43,10 @@ class Run:
 
     `time`, `command`, `accel`, `speed`: the logged signals. `noise_accel`: the part of `accel` that is process and
     sensor noise. `noise_speed`: the part of `speed` that is sensor noise and rounding; `drift_speed`: process noise
-    integrated since the start of the drive. `chance_accel`, `chance_speed`: the unpredictable part of an effect (gusts,
-    outliers), the latter also integrated. `felt_accel`: how far the reading of process noise and gusts by a lagging or
-    wrongly scaled accelerometer differs from these themselves. `true_accel`, `true_speed`, `position`: the car's own.
+    integrated since the start of the drive, as the sensor shows it. `chance_accel`, `chance_speed`: the unpredictable
+    part of an effect (gusts, outliers), the latter also integrated. `felt_accel`: how far the reading of process noise
+    and gusts by a lagging or wrongly scaled accelerometer differs from these themselves. `true_accel`, `true_speed`,
+    `position`: the car's own.
 
     Example:
         >>> import numpy as np
@@ -133,22 +134,22 @@ class _Drive:
         self._draw()
         disturbance = (self.process + self.gust).tolist()
         disturbance.append(disturbance[-1])
-        self._chain({}, None, 0.0, 0.0)
+        self._chain({}, None, 0.0, 0.0, 0.0)
         a_out, twist, speed, position = 0.0, 0.0, self.pilot.start_speed, 0.0
         total = disturbance[0]
         white_a, white_v = self.white_accel.tolist(), self.white_speed.tolist()
         quantum = self.car.speed_quantum
-        accels, speeds, places, filtered = [total], [speed], [position], [total]
+        accels, speeds, places, filtered, shown = [total], [speed], [position], [total], [speed]
         commands, readings_a, readings_v = [], [], []
         per_row, half = self.per_row, 0.5 * STEP_S
         for row in range(self.rows):
             time = row * per_row * STEP_S
             if row == self.first and self.effects:
-                self._chain(self.effects, self.bus, a_out, filtered[-1])
-            bus, actuate, push, filter_, sensors, mode = (
-                self.bus, self.actuate, self.push, self.filters, self.sensors, self.mode,
+                self._chain(self.effects, self.bus, a_out, filtered[-1], shown[-1])
+            bus, actuate, push, filter_, of_speed, sensors, mode = (
+                self.bus, self.actuate, self.push, self.filters, self.of_speed, self.sensors, self.mode,
             )  # fmt: skip
-            read_a, read_v = self._read(sensors, time, filtered, accels, speeds, places)
+            read_a, read_v = self._read(sensors, time, filtered, accels, shown, places)
             read_a += white_a[row]
             read_v = max(read_v + white_v[row], 0.0)
             if quantum:
@@ -184,7 +185,10 @@ class _Drive:
                     for stage in filter_:
                         accel = stage(accel)
                 filtered.append(accel)
-        return self._logged(commands, readings_a, readings_v, accels, speeds, places)
+                for stage in of_speed:
+                    new = stage(new)
+                shown.append(new)
+        return self._logged(commands, readings_a, readings_v, accels, speeds, shown, places)
 
     def _draw(self) -> None:
         """Draw all random signals that do not depend on the car's motion."""
@@ -210,7 +214,12 @@ class _Drive:
             self.white_accel[hit] += size[hit]
 
     def _chain(
-        self, effects: Mapping[str, Mapping[str, float]], earlier: Command | None, a_out: float, accel: float
+        self,
+        effects: Mapping[str, Mapping[str, float]],
+        earlier: Command | None,
+        a_out: float,
+        accel: float,
+        speed: float,
     ) -> None:
         """Build the chain with these effects, starting from the state of the earlier chain."""
         lost = None
@@ -223,7 +232,7 @@ class _Drive:
         self.actuate = actuator(self.car, effects, a_out)
         self.push = forces(effects, self.stream, reach=self.reach)
         self.mode = driveline(effects["driveline_oscillation"]) if "driveline_oscillation" in effects else None
-        self.filters = filters(effects, accel)
+        self.filters, self.of_speed = filters(effects, accel), filters(effects, speed, speed=True)
         self.sensors = Readings(effects, self.stream, reach=self.reach, seconds=self.seconds, onset=self.onset)
 
     def _read(
@@ -265,19 +274,24 @@ class _Drive:
         readings_v: list[float],
         accels: list[float],
         speeds: list[float],
+        shown: list[float],
         places: list[float],
     ) -> Run:
         rows = np.arange(self.rows) * self.per_row
         accel, speed = np.array(readings_a), np.array(readings_v)
-        true_v = np.array(speeds)[rows]
+        begin = self.first * self.per_row
 
         def summed(x: FloatArray) -> FloatArray:
-            return (np.cumsum(x) * STEP_S - 0.5 * STEP_S * (x + x[0]))[rows]
+            """The speed gained by `x` as the sensor shows it."""
+            gained = np.cumsum(x) * STEP_S - 0.5 * STEP_S * (x + x[0])
+            for late in filters(self.effects, float(gained[begin]), speed=True):
+                gained[begin:] = [late(y) for y in gained[begin:].tolist()]
+            return gained[rows]
 
         quantised = 0.0
         if self.car.speed_quantum:
             grid = self.car.speed_quantum
-            fine = true_v + self.white_speed
+            fine = np.array(shown)[rows] + self.white_speed
             quantised = grid * np.round(fine / grid) - fine
         return Run(
             time=np.asarray(rows * STEP_S, np.float64),
@@ -291,6 +305,6 @@ class _Drive:
             chance_speed=summed(self.gust),
             felt_accel=self._felt(),
             true_accel=np.array(accels)[rows],
-            true_speed=true_v,
+            true_speed=np.array(speeds)[rows],
             position=np.array(places)[rows],
         )

@@ -15,7 +15,7 @@ NUMBER = 20
 MIX = {"none": 0.2, "single": 0.35, "pair": 0.15, "outside": 0.15, "several": 0.15}
 SECONDS = (60.0, 120.0, 300.0)
 """Lengths of the drives, by turns [s]."""
-DRAWN = tuple(name for name in EFFECTS if name not in ("hand_over", "viscous_drag"))
+DRAWN = tuple(name for name in EFFECTS if name not in ("hand_over", "viscous_drag", "speed_lag"))
 """Causes of the set: those of the table when it was first drawn."""
 
 

@@ -24,6 +24,7 @@ from avtorch.vehicle import ClosedLoop, GLVDPlant, Leader
 
 DT, WARM, AHEAD, LEARNT = 0.05, 40, 200, 100  # [s], rows of the past, of a rollout, of a rollout that is learnt from
 BACK = 10  # rows that the feed-forward network sees
+UNITS = 24  # of the recurrent network
 SLOPE = 6  # rows over which a speed's slope is taken at the start
 NOISE_MPS = 0.002
 Drive = Tensor
@@ -115,22 +116,32 @@ class OneStep(nn.Module):
 
 
 class Recurrent(nn.Module):
-    """A GRU cell of 24 units: the past warms it up with measured speeds, then its own come back."""
+    """A GRU cell of 24 units: the past warms it up with measured speeds, then its own come back.
 
-    def __init__(self) -> None:
+    `dt` [s] of its rows; `middle` and `spread` of commands, slopes and speeds, by which they are scaled.
+    """
+
+    def __init__(
+        self, dt: float = DT, middle: Sequence[float] = (0.0, 0.0, 10.0), spread: Sequence[float] = (1.0, 1.0, 10.0)
+    ) -> None:
         super().__init__()
-        self.cell, self.out = nn.GRUCell(3, 24), nn.Linear(24, 1)
+        self.cell, self.out = nn.GRUCell(3, UNITS), nn.Linear(UNITS, 1)
+        self.dt, self.middle, self.spread = dt, torch.tensor(middle), torch.tensor(spread)
+
+    def forward(self, u: Tensor, a: Tensor, v: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
+        """The next slope ``(drive,)`` and state, from command, last slope and speed ``(drive,)``."""
+        h = self.cell((torch.stack([u, a, v], -1) - self.middle) / self.spread, h)
+        return self.spread[1] * self.out(h)[:, 0], h
 
     def rollout(self, past: Tensor, u: Tensor) -> Tensor:
-        h = past.new_zeros(len(past), 24)
-        slope = (past[:, 1:, 1] - past[:, :-1, 1]) / DT
-        for k in range(past.shape[1] - 1):
-            h = self.cell(torch.stack([past[:, k, 0], slope[:, k], past[:, k + 1, 1] / 10 - 1], -1), h)
+        h = past.new_zeros(len(past), UNITS)
+        slope = (past[:, 1:, 1] - past[:, :-1, 1]) / self.dt
+        for k in range(1, past.shape[1] - 1):
+            _, h = self(past[:, k, 0], slope[:, k - 1], past[:, k, 1], h)
         v, a, speeds = past[:, -1, 1], slope[:, -1], []
         for k in range(u.shape[1]):
-            h = self.cell(torch.stack([u[:, k], a, v / 10 - 1], -1), h)
-            a = self.out(h)[:, 0]
-            v = v + DT * a
+            a, h = self(u[:, k], a, v, h)
+            v = v + self.dt * a
             speeds.append(v)
         return torch.stack(speeds, 1)
 

@@ -3,7 +3,7 @@
 Example:
     >>> from avtorch.gap import effects
     >>> len(effects.__all__), effects.DeadTime.place, effects.DeadTime.equation
-    (24, 'command', 'u(t - tau)')
+    (25, 'command', 'u(t - tau)')
 """
 
 from avtorch.gap.effects.aerodynamic_drag import AerodynamicDrag
@@ -29,6 +29,7 @@ from avtorch.gap.effects.sensor_lag import SensorLag
 from avtorch.gap.effects.sensor_scale import SensorScale
 from avtorch.gap.effects.speed_dependent_gain import SpeedDependentGain
 from avtorch.gap.effects.speed_dependent_lag import SpeedDependentLag
+from avtorch.gap.effects.speed_lag import SpeedSensorLag
 from avtorch.gap.effects.viscous_drag import ViscousDrag
 
 __all__ = [
@@ -55,5 +56,6 @@ __all__ = [
     "SensorScale",
     "SpeedDependentGain",
     "SpeedDependentLag",
+    "SpeedSensorLag",
     "ViscousDrag",
 ]

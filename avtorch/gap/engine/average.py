@@ -52,7 +52,7 @@ from avtorch.gap.engine.slow_forces import (
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
 _EXAMINED = 8  # hypotheses that are examined in full
-_LINEAR = frozenset({"dead_time", "second_order_actuator", "sensor_lag", "driveline_oscillation"})
+_LINEAR = frozenset({"dead_time", "second_order_actuator", "sensor_lag", "speed_lag", "driveline_oscillation"})
 _FAINT_GUST = FAINT_OF_RANGE * TABLE["gust"].parameters[0].low
 _LARGE_OF_COMMAND = 0.2  # a slow force has a name, with one channel, from this share of the command's spread on
 _LEAST_LISTED = 1e-4

@@ -141,5 +141,5 @@ def _signals(h: Car) -> tuple[FloatArray, FloatArray]:
         with torch.inference_mode():
             response = car.response(drive)
         accel[i:j] = response.accel_measured.numpy()
-        gained[i:j] = (response.speed - response.speed[0]).numpy()
+        gained[i:j] = (response.speed_measured - response.speed_measured[0]).numpy()
     return accel, gained

@@ -6,7 +6,7 @@ is given on a grid of steps of at most `GRID_S`, so that what a recorder delays 
     command      saturation, dead band, play, pause of the hand-over, dead time
     actuator     tau² a'' + T a' + a = g, a' bounded;  g = K u times gains by sign, speed, time and gear; T likewise
     body         ring of the driveline, drags, resistance, creep
-    sensor       first-order filter, scale, offset
+    sensor       first-order filter, scale, offset; first-order filter of the speed
 
 Each step is integrated exactly for a held target; the speed gains the actuator's integral and the forces' trapezoids.
 A parameter acts from its own time on and is neutral before.
@@ -40,6 +40,7 @@ _RING_F, _RING_Z = INDEX["ring_frequency"], INDEX["ring_damping"]
 _FREE, _FREE_F = INDEX["free_pole"], INDEX["free_frequency"]
 _DRAG, _WIND, _VISCOUS = INDEX["drag"], INDEX["wind"], INDEX["viscous"]
 _ROLL, _CREEP = INDEX["resistance"], INDEX["creep"]
+_SPEED_LAG = INDEX["speed_lag"]
 _SENSOR_LAG, _SCALE, _BIAS = INDEX["sensor_lag"], INDEX["sensor_scale"], INDEX["sensor_bias"]
 
 _LEAST_FACTOR = 0.05  # as in `effects.speed_dependent_gain`
@@ -125,7 +126,7 @@ def simulate(  # pragma: no cover - compiled
     accel: FloatArray,
     gained: FloatArray,
 ) -> None:
-    """The sensor's acceleration `accel` (grid,) [m/s²] and the speed `gained` (grid,) [m/s] since a stretch's start.
+    """Readings of the acceleration, `accel` (grid,) [m/s²], and of the speed `gained` (grid,) [m/s] in its stretch.
 
     `p` (parameter,) values, `acts` (parameter,) the times [s] from which they act; `time`, `command`, `speed`, `starts`
     (grid,): steps, held commands, the speed that effects read, and where stretches start; `accel0` (grid,): the car's
@@ -139,7 +140,7 @@ def simulate(  # pragma: no cover - compiled
     ramp = math.exp(p[_RAMP])
     above = np.zeros(gears, np.bool_)
     since = np.full(gears, -1e9)
-    a = w = slewed = ring_y = ring_r = free_y = free_r = reading = v_gained = 0.0
+    a = w = slewed = ring_y = ring_r = free_y = free_r = reading = v_gained = v_reading = v_shown = 0.0
     force = before_shown = 0.0
     first = 0
     k1 = 0
@@ -202,7 +203,15 @@ def simulate(  # pragma: no cover - compiled
             reading = s_keep * reading + s_old * before_shown + s_new * shown
         before_shown = shown
         accel[k] = (1.0 + q[_SCALE]) * reading + q[_BIAS]
-        gained[k] = v_gained
+        if starts[k] or q[_SPEED_LAG] <= 1e-9:
+            v_reading = v_gained
+        else:
+            h = time[k] - time[k - 1]
+            decay = math.expm1(-h / q[_SPEED_LAG])
+            held = -q[_SPEED_LAG] / h * decay
+            v_reading = (1.0 + decay) * v_reading + (held - 1.0 - decay) * v_shown + (1.0 - held) * v_gained
+        v_shown = v_gained
+        gained[k] = v_reading
         if k == n - 1 or starts[k + 1]:
             continue
         h = time[k + 1] - t

@@ -28,7 +28,7 @@ NAMES = (
     *("lag_slope", "gain_slope", "gain_step", "gain_ramp", "shift_depth", "shift_duration", "shift_hysteresis"),
     *("ring_amplitude", "ring_quadrature", "ring_frequency", "ring_damping", "drag", "wind", "viscous"),
     *("resistance", "creep"),
-    *("sensor_lag", "sensor_bias", "sensor_scale", "free_pole", "free_frequency"),
+    *("sensor_lag", "sensor_bias", "sensor_scale", "speed_lag", "free_pole", "free_frequency"),
 )
 """Of the value vector (parameter,), in its order."""
 INDEX: dict[str, int] = {name: i for i, name in enumerate(NAMES)}
@@ -325,6 +325,9 @@ EFFECTS: dict[str, EngineEffect] = {
             ((0.1,),),
             "may",
             _BOTH,
+        ),
+        EngineEffect(
+            "speed_lag", (_sized("speed_lag", "speed_lag", "lag_s", "value", 0, 6),), ((0.2,), (0.5,)), "may", _BOTH
         ),
     )
 }

@@ -12,7 +12,7 @@ FAMILIES = {
     ),
     "place": ("road_grade",),
     "time": ("gain_change",),
-    "sensor": ("sensor_lag", "sensor_bias", "sensor_scale"),
+    "sensor": ("sensor_lag", "sensor_bias", "sensor_scale", "speed_lag"),
     "chance": ("gust", "outliers", "command_hold"),
 }
 """Names of the effects of each."""

@@ -23,7 +23,7 @@ _RECORDER = {
 }
 _STEPS = {"T_L": 0.01, "K_L": 0.005} | dict.fromkeys(_RECORDER, 0.004)  # of finite differences
 _BASE = {"T_L": (math.log(0.3), 1.5), "K_L": (1.0, 0.5)}  # wide: only a fit without information feels them
-_LATE = ("T_L", "dead_time", "sensor_lag", *_RECORDER, "square_period")
+_LATE = ("T_L", "dead_time", "sensor_lag", "speed_lag", *_RECORDER, "square_period")
 _LATER = 0.1  # of the lag: a change of timing from which the columns of a force map are computed anew
 _FORCE_STEP = 0.05  # of a coefficient of a force map, in the finite difference
 _WIDE = 4.0  # a fit's normal prior of a size, over the scale of its Student prior

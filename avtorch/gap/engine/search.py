@@ -35,7 +35,12 @@ _FINISHED = 3  # of these, how many are finished
 _RAMPS = 10  # of a gain that changes, from a second to the drive's length
 _MARGIN_S = 8.0  # no onset this near to an end of the drive
 _LEAST_PROMISE = 1.5  # nats: less is the gain of a parameter that does nothing
-_SLOPES = {"dead_time": 0.02, "sensor_lag": 0.02, "square_period": 0.002}  # where a recorder hides a finite step
+_SLOPES = {
+    "dead_time": 0.02,
+    "sensor_lag": 0.02,
+    "speed_lag": 0.02,
+    "square_period": 0.002,
+}  # where a recorder hides a finite step
 _SLOW_MPS = 3.0
 
 

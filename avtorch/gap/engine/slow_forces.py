@@ -437,19 +437,23 @@ def _mean_speed(data: DriveData) -> float:
 
 
 def _before_the_sensor(data: DriveData, values: FloatArray, bands: int) -> FloatArray:
-    """Factors (band, channel, channel) of a covariance: what pushes the car passes the accelerometer's lag and scale.
+    """Factors (band, channel, channel) of a covariance: what pushes the car passes the lags and the scale of readings.
 
     Of a common power P the accelerometer shows P |H|², and P Re H together with the speed; for one pole of scale k,
     P k² / L and P k / L with L = 1 + (w tau)². Scaled by L / k it shows P in common with the speed, and what is out of
-    phase beside its own noise. A reading is scaled, so that a covariance stays one.
+    phase beside its own noise. So does a speed that lags; where both do, the slower one is scaled by what it lags
+    more. A reading is scaled, so that a covariance stays one.
     """
     out = np.ones((bands, data.channel_count, data.channel_count))
     if data.channel_count == 2:
         first, last = data.band_edges[:bands], data.band_edges[1 : bands + 1] - 1
         w = np.pi * (data.frequency[first] + data.frequency[last])
-        scale = (1 + (w * values[INDEX["sensor_lag"]]) ** 2) / (1 + values[INDEX["sensor_scale"]])
-        out[:, 0, 0] = scale**2
-        out[:, 0, 1] = out[:, 1, 0] = scale
+        lags = w * values[[INDEX["sensor_lag"], INDEX["speed_lag"]]][:, None]
+        quick, slow = np.sort(1 + lags**2, axis=0)
+        scales = np.array([np.sqrt(quick), slow * np.sqrt(quick) / (1 + lags.prod(0))])
+        scales = scales[np.argsort(lags[:, -1])]
+        scales[0] /= 1 + values[INDEX["sensor_scale"]]
+        out = scales.T[:, :, None] * scales.T[:, None, :]
     return out
 
 

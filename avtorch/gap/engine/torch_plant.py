@@ -35,7 +35,7 @@ from avtorch.gap.simulator.simulator_input import SimulatorInput
 Values = Mapping[str, Tensor]
 """Coordinates by name, (column,) each, or () where all columns share the value."""
 
-_FILLING = frozenset({"backlash", "sensor_lag"})
+_FILLING = frozenset({"backlash", "sensor_lag", "speed_lag"})
 _UNNAMED = "~linear"
 _NO_LIMIT = 1e9  # [m/s², m/s³] replaces infinity, whose gradients are undefined
 
@@ -98,7 +98,7 @@ class SimulatorPlant:
                 if c.parameter:
                     own[f"{base_name(effect)}.{c.parameter}"] = own_value(c, values[c.name])
         responses = [self.plant.response(drive, own) for drive in self.drives]
-        gained = [r.speed - r.speed[..., :1] for r in responses]
+        gained = [r.speed_measured - r.speed_measured[..., :1] for r in responses]
         return torch.cat([r.accel_measured for r in responses], -1), torch.cat(gained, -1)
 
 
@@ -136,7 +136,7 @@ class TorchPlant:
         return cls(h, tuple(_acting(h)), tuple(stretches))
 
     def on_grid(self, values: Values) -> tuple[Tensor, Tensor]:
-        """The accelerometer's reading [m/s²] and the speed gained in its stretch [m/s], (column, grid) each.
+        """The accelerometer's reading [m/s²] and the speed's reading gained in its stretch [m/s], (column, grid) each.
 
         `values`: every coordinate of the vector that differs from the hypothesis's, `T_L` among them.
         """
@@ -179,7 +179,10 @@ class TorchPlant:
         for e in at_place(chain, "sensor"):
             accel = hook(e, accel)
         zero = torch.zeros(*columns, 1, dtype=torch.float64)
-        return accel.expand(*columns, steps), torch.cat([zero, gained.expand(*columns, -1).cumsum(-1)], -1)
+        speed = torch.cat([zero, gained.expand(*columns, -1).cumsum(-1)], -1)
+        for e in at_place(chain, "sensor", "speed"):
+            speed = hook(e, speed)
+        return accel.expand(*columns, steps), speed
 
     def _effect(self, name: str, values: Values, time: Tensor, first: int) -> Effect:
         """The table's effect with values (column, 1), or (column, time) where it is neutral before a row `first`."""

@@ -46,7 +46,7 @@ class Around:
     def car(self, u: float, accel: float, speed: float) -> tuple[float, float]:
         """The car's measured acceleration [m/s²] and speed [m/s] now."""
         past = self._at(u, accel, speed)
-        return float(past.seen), float(past.speed)
+        return float(past.seen), float(past.seen_speed)
 
     def advance(self, u: float, accel: float, speed: float) -> None:
         """Go on to the next time, `u` held until then."""
@@ -70,7 +70,7 @@ class Around:
         for e in at_place(past.effects, "sensor"):
             at = drawn_for(past, e, row, 0)
             seen = e.advance(seen, at, e.start(seen, at))[0]
-        return replace(past, seen=seen, speed=v)
+        return replace(past, seen=seen, speed=v, seen_speed=v)
 
     def _next(self, past: SimulationState, accel: float, speed: float) -> SimulationState:
         """The forces at the speed that they lead to, by trapezoids, as `stepping.move` has them."""
@@ -89,7 +89,10 @@ class Around:
         after, seen = self._context(past, v), a + force
         for e in at_place(past.effects, "sensor"):
             seen, memory[e.name] = e.advance(seen, drawn_for(past, e, after, past.row), past.memory[e.name])
-        return replace(past, seen=seen, speed=v, position=position, force=force, memory=memory)
+        shown = v
+        for e in at_place(past.effects, "sensor", "speed"):
+            shown, memory[e.name] = e.advance(shown, after, past.memory[e.name])
+        return replace(past, seen=seen, seen_speed=shown, speed=v, position=position, force=force, memory=memory)
 
     def _context(self, past: SimulationState, v: Tensor) -> Any:
         moved = 0.5 * self._dt * (self._shown[1] + v) if past.row else torch.zeros_like(v)

@@ -8,7 +8,7 @@ command → actuator → body → sensor, and its one hook means there:
 | command  | command [m/s²]                       | command [m/s²]                                            |
 | actuator | command [m/s²] as it arrives         | `(gain, lag)`, factors on K_L and T_L                     |
 | body     | acceleration of the actuator [m/s²]  | additional acceleration of the car [m/s²]                 |
-| sensor   | acceleration of the car [m/s²]       | acceleration shown [m/s²]                                 |
+| sensor   | acceleration of the car [m/s²]       | acceleration shown [m/s²] (`reading`: or speed, [m/s])    |
 
 Without memory the hook is `apply(x, row)`, and one definition serves both a single step of a simulation and a whole
 drive: only the shapes differ. With memory it is `start` and `advance`, one row at a time, and `over`, a whole drive.
@@ -42,7 +42,7 @@ PLACES: tuple[Place, ...] = ("command", "actuator", "body", "sensor")
 Example:
     >>> from avtorch.gap import EFFECTS, PLACES
     >>> {place: sum(effect.place == place for effect in EFFECTS.values()) for place in PLACES}
-    {'command': 6, 'actuator': 7, 'body': 7, 'sensor': 4}
+    {'command': 6, 'actuator': 7, 'body': 7, 'sensor': 5}
 """
 
 _LARGEST = 1e12  # limit for a number in a text without a declared domain
@@ -80,10 +80,11 @@ class NoiseChange:
 class Effect:
     """Base of all effects; the module docstring lists the hooks. `order` sorts effects at the same place.
 
-    `gravity`: a body force that an accelerometer does not measure (see `SimulatorInput.specific_force`). `derived`:
-    what `report` names in place of coordinates that are not reported, with typical and possible ranges. `shift`: the
-    parameter [s], if there is one, by which it delays commands and does nothing else. `settings`: valid values in a
-    text for fields that are not parameters; a field without a domain takes any single finite number.
+    `reading`: what a sensor's effect acts on. `gravity`: a body force that an accelerometer does not measure (see
+    `SimulatorInput.specific_force`). `derived`: what `report` names in place of coordinates that are not reported,
+    with typical and possible ranges. `shift`: the parameter [s], if there is one, by which it delays commands and does
+    nothing else. `settings`: valid values in a text for fields that are not parameters; a field without a domain takes
+    any single finite number.
 
     `own_onset`: the parameter [s] that is its onset; no other onset is tried. `of_the_drive`: its parameters belong to
     a drive and not to the car. `memory`, `random`: whether it has `advance` and `noise`, which need not be said.
@@ -109,6 +110,7 @@ class Effect:
     parameters: ClassVar[tuple[Parameter, ...]]
     settings: ClassVar[tuple[Domain, ...]] = ()
     order: ClassVar[int] = 0
+    reading: ClassVar[Literal["accel", "speed"]] = "accel"
     needs_speed: ClassVar[bool] = False
     gravity: ClassVar[bool] = False
     derived: ClassVar[tuple[Parameter, ...]] = ()
@@ -242,7 +244,7 @@ EFFECTS: dict[str, type[Effect]] = {}
 Example:
     >>> from avtorch.gap import EFFECTS
     >>> len(EFFECTS), [name for name, effect in EFFECTS.items() if effect.place == "sensor"]
-    (24, ['outliers', 'sensor_bias', 'sensor_lag', 'sensor_scale'])
+    (25, ['outliers', 'sensor_bias', 'sensor_lag', 'sensor_scale', 'speed_lag'])
 """
 
 E = TypeVar("E", bound=type[Effect])

@@ -120,7 +120,7 @@ def not_observable(channels: Collection[str], effects: Iterable[type[Effect]]) -
     if "accel" not in channels:
         names = ", ".join(e.name for e in hidden)
         return f"Without accel in the log these effects cannot be tested, as speed does not show them: {names}."
-    need = ", ".join(e.name for e in hidden if not is_gain(e))
+    need = ", ".join(e.name for e in hidden if e.reading == "accel" and not is_gain(e))
     said = [f"Without speed in the log these effects cannot be tested and appear as others: {need}."] if need else []
     gains = [e.name for e in hidden if is_gain(e)]
     said += [f"Without speed in the log {name} is equivalent to another K_L and cannot be tested." for name in gains]

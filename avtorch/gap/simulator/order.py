@@ -20,9 +20,9 @@ def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
     return tuple(sorted(effects, key=lambda e: (PLACES.index(e.place), e.order, e.name)))
 
 
-def at_place(effects: Iterable[Effect], place: Place) -> list[Effect]:
-    """The effects at that place, in order."""
-    return [e for e in effects if e.place == place]
+def at_place(effects: Iterable[Effect], place: Place, reading: str = "accel") -> list[Effect]:
+    """The effects at that place, in order; of a sensor's those on that reading."""
+    return [e for e in effects if e.place == place and e.reading == reading]
 
 
 def substeps(effects: Iterable[Effect], u: Tensor, row: EffectContext, hook: Hook) -> list[Substep]:

@@ -162,6 +162,10 @@ class GapPlant:
         motion, self._past = move(past, v, u, dt, eps)
         return motion
 
+    def speed_reading(self, a: Tensor, v: Tensor) -> Tensor:
+        """The speed [m/s] that the sensor shows after the step that returned `a`; `v`, the car's, in a new drive."""
+        return v if self._past is None or not goes_on(self._past, a) else self._past.seen_speed
+
     def reset(self) -> None:
         """Discard the state of the drive: the next step starts a new one."""
         self._past = None

@@ -78,7 +78,10 @@ def rollout(
         measured = e.over(measured, rows[e.name])
     v0 = torch.zeros((), dtype=a.dtype) if drive.speed is None else drive.speed[..., 0]
     v0 = v0.expand(shape[:-1])[..., None]
-    return Response(accel, measured, torch.cat([v0, v0 + gained.cumsum(-1)], -1))
+    shown = speed = torch.cat([v0, v0 + gained.cumsum(-1)], -1)
+    for e in at_place(whole, "sensor", "speed"):
+        shown = e.over(shown, rows[e.name])
+    return Response(accel, measured, speed, shown)
 
 
 def _shape(effects: list[Effect], row: EffectContext, drive: SimulatorInput) -> torch.Size:

@@ -102,7 +102,8 @@ class SimulatorInput:
 
 @dataclass(frozen=True)
 class Response:
-    """Response of a plant over a drive, (..., time): `accel` of the car and `accel_measured` [m/s²], `speed` [m/s].
+    """Response of a plant over a drive, (..., time): `accel` of the car and `accel_measured` [m/s²], `speed` of the car
+    and `speed_measured` [m/s].
 
     `speed` is the car's acceleration integrated from the first measured speed (0 where there is none). The response
     does not stop at standstill; such rows are masked.
@@ -119,3 +120,4 @@ class Response:
     accel: Tensor
     accel_measured: Tensor
     speed: Tensor
+    speed_measured: Tensor

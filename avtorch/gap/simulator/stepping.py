@@ -36,6 +36,7 @@ class SimulationState:
     time: float
     dt: float  # the step that led to this state
     seen: Tensor  # the acceleration returned to the loop
+    seen_speed: Tensor  # the speed that the sensor shows
     speed: Tensor
     position: Tensor
     actuator: ActuatorState
@@ -67,7 +68,7 @@ def begin(
     shape = np.broadcast_shapes(a.shape, v.shape, u.shape)
     a, v, u = (x.expand(shape) for x in (a, v, u))
     zero = torch.zeros_like(v)
-    past = SimulationState(effects, T_L, K_L, noise, 0, 0.0, dt, a, v, zero, ActuatorState(a), zero, {})
+    past = SimulationState(effects, T_L, K_L, noise, 0, 0.0, dt, a, v, v, zero, ActuatorState(a), zero, {})
     row = context_of(past, 0.0, v, zero, dt)
     memory: dict[str, Any] = {}
     for e in effects:  # each in steady state at the previous one's output
@@ -89,6 +90,8 @@ def begin(
     for e in at_place(effects, "sensor"):
         at = drawn_for(past, e, row, past.row)
         measured, memory[e.name] = e.advance(measured, at, e.start(measured, at))
+    for e in at_place(effects, "sensor", "speed"):
+        memory[e.name] = e.advance(v, row, e.start(v, row))[1]
     return replace(past, actuator=actuator_of(effects).steady_state(own), force=force, memory=memory)
 
 
@@ -124,12 +127,16 @@ def move(past: SimulationState, v: Tensor, u: Tensor, dt: float, eps: Tensor) ->
     seen = state.accel + force
     for e in at_place(past.effects, "sensor"):
         seen, memory[e.name] = e.advance(seen, drawn_for(past, e, after, number), memory[e.name])
+    seen_speed = speed.clamp_min(0.0)  # no car rolls back
+    for e in at_place(past.effects, "sensor", "speed"):
+        seen_speed, memory[e.name] = e.advance(seen_speed, after, memory[e.name])
     kept = replace(
         past,
         row=number,
         time=time,
         dt=dt,
         seen=seen,
+        seen_speed=seen_speed,
         speed=v,
         position=position,
         actuator=state,

@@ -62,7 +62,7 @@ def likelihood_bic(log: Log) -> dict[str, Any]:
 
 def candidates(log: Log) -> list[str]:
     """Effects that the log's channels can show at all."""
-    needs_accel = {"sensor_lag", "sensor_bias", "sensor_scale", "outliers"}
+    needs_accel = {"speed_lag", "sensor_lag", "sensor_bias", "sensor_scale", "outliers"}
     return [
         name
         for name, effect in EFFECTS.items()

@@ -79,7 +79,7 @@ class Residuals:
         parts = []
         for drive in self.drives:
             answer = plant.response(drive, values)
-            gained = answer.speed.diff(dim=-1, append=answer.speed[..., -1:])
+            gained = answer.speed_measured.diff(dim=-1, append=answer.speed_measured[..., -1:])
             response = {"accel": answer.accel_measured, "speed": gained}
             batch = np.broadcast_shapes(*(response[name].shape for name in self.channels))
             parts.append(torch.stack([response[name].expand(batch) for name in self.channels], -2).numpy())

@@ -16,13 +16,13 @@ from benchmarks.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, family
 from benchmarks.blindtest.deck import MIX, card, kind_of
 from benchmarks.blindtest.visibility import TIERS
 
-# the 24 names of the table
+# the 25 names of the table
 NAMES = """
     dead_time command_hold dead_band backlash hand_over
     saturation brake_throttle_asymmetry second_order_actuator rate_limit speed_dependent_lag speed_dependent_gain
     gain_change gear_shift
     driveline_oscillation aerodynamic_drag viscous_drag road_grade constant_resistance low_speed_creep gust
-    sensor_lag sensor_bias sensor_scale outliers
+    sensor_lag sensor_bias sensor_scale speed_lag outliers
 """
 
 

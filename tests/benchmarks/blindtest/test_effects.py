@@ -162,6 +162,9 @@ def test_sensor_faults_leave_the_motion_alone() -> None:
     fine = np.repeat(COMMAND, 20)
     lagged = lfilter([0.0, -np.expm1(-0.001 / 0.3)], [1.0, -np.exp(-0.001 / 0.3)], glvd(fine, dt=0.001))[::20]
     close(drive("sensor_lag", lag_s=0.3), np.asarray(lagged), atol=5e-3)
+    late = drive("speed_lag", u=np.ones(300), lag_s=0.4)
+    close(late, glvd(np.ones(300)))
+    np.testing.assert_allclose((late.true_speed - late.speed)[-50:], 0.4 * CAR.K_L, atol=1e-3)  # all has settled
 
 
 @pytest.mark.statistical

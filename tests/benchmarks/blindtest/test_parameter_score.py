@@ -131,6 +131,7 @@ PREDICTABLE: dict[str, dict[str, float]] = {
     "aerodynamic_drag": {"drag_per_m": 5e-4, "wind_mps": 2.0, "wind_swing_mps": 0.0, "wind_period_s": 60.0},
     "constant_resistance": {"resistance_mps2": 0.2},
     "sensor_lag": {"lag_s": 0.3},
+    "speed_lag": {"lag_s": 0.3},
     "sensor_bias": {"bias_mps2": 0.2},
     "sensor_scale": {"scale": 1.2},
 }
@@ -153,9 +154,12 @@ def misfit(effect: str, given: dict[str, float], factor: float, start_speed: flo
     values = {key: value for key, value in values.items() if key in known} | {parameter: factor * given[parameter]}
     drive = SimulatorInput(torch.as_tensor(run.time), torch.as_tensor(run.command), torch.as_tensor(run.true_speed))
     lag = None if effect == "second_order_actuator" else T_L  # which has its own, by its damping
-    found = plant([effect_class(effect).of(values)], T_L=lag, K_L=K_L).response(drive).accel_measured.numpy()
+    response = plant([effect_class(effect).of(values)], T_L=lag, K_L=K_L).response(drive)
+    found, shown = response.accel_measured.numpy(), run.accel
+    if effect_class(effect).reading == "speed":
+        found, shown = np.gradient(response.speed_measured.numpy()), np.gradient(run.speed)
     settled = slice(5 * RATE, None)  # one side starts at rest, the other in the first command's steady state
-    return float(np.sqrt(np.mean((found - run.accel)[settled] ** 2)))
+    return float(np.sqrt(np.mean((found - shown)[settled] ** 2)))
 
 
 @pytest.mark.parametrize("effect", PREDICTABLE)

@@ -57,9 +57,11 @@ def test_speed_and_position_are_the_integrals() -> None:
 
 
 def test_noise_of_the_car_is_superposed_and_reported() -> None:
-    run = drive(car=Car(T_L=CAR.T_L, K_L=CAR.K_L, process_sd=0.1, accel_sd=0.1, speed_sd=0.05, speed_quantum=0.02))
+    effects = {"speed_lag": {"lag_s": 0.4}}
+    noisy = Car(T_L=CAR.T_L, K_L=CAR.K_L, process_sd=0.1, accel_sd=0.1, speed_sd=0.05, speed_quantum=0.02)
+    run = drive(car=noisy, effects=effects)
     np.testing.assert_allclose(run.accel - run.noise_accel, glvd(run.command), atol=1e-6, rtol=0)
-    clean = drive().speed
+    clean = drive(effects=effects).speed
     np.testing.assert_allclose(run.speed - run.noise_speed - run.drift_speed, clean, atol=1e-5, rtol=0)
     np.testing.assert_allclose(run.speed / 0.02, np.round(run.speed / 0.02), atol=1e-6)
 

@@ -38,6 +38,7 @@ VALUES = {
     "sensor_lag": (0.23,),
     "sensor_bias": (-0.1,),
     "sensor_scale": (0.12,),
+    "speed_lag": (0.31,),
 }
 PAIRS = list(combinations(VALUES, 2))
 
@@ -70,7 +71,7 @@ def _by_the_simulator(h: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
         float(grid.accel0[0]),
     )
     response = car.plant_of(h).response(drive)
-    return response.accel_measured.numpy(), (response.speed - response.speed[0]).numpy()
+    return response.accel_measured.numpy(), (response.speed_measured - response.speed_measured[0]).numpy()
 
 
 @pytest.mark.parametrize("effects", [(), *[(e,) for e in VALUES]], ids="+".join)

@@ -26,7 +26,16 @@ BENT = ForceTable((0.0, 2.0), (0.0, 30.0), ((0.0, 0.0), (0.0, -1.0)))
         (
             lambda kind: kind.memory,
             {
-                *["gear_shift", "backlash", "dead_time", "hand_over", "sensor_lag", "command_hold", "gust"],
+                *[
+                    "gear_shift",
+                    "backlash",
+                    "dead_time",
+                    "hand_over",
+                    "sensor_lag",
+                    "speed_lag",
+                    "command_hold",
+                    "gust",
+                ],
                 "driveline_oscillation",
             },
         ),

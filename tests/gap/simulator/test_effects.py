@@ -41,6 +41,7 @@ TABLE = {
     "sensor_lag": ("sensor", "lag_s"),
     "sensor_bias": ("sensor", "bias_mps2"),
     "sensor_scale": ("sensor", "scale"),
+    "speed_lag": ("sensor", "lag_s"),
     "outliers": ("sensor", "fraction", "scale"),
 }
 EVERY = [EFFECTS[name] for name in TABLE]
@@ -88,11 +89,13 @@ def test_whole_drive_is_step_by_step(cls: type[Effect]) -> None:
     block = driven(car, seconds=7.5, speed0=first)
     assert float(block.speed.min()) > 1.0
     without = without_effect(0.3, 1.0, seconds=7.5, speed0=first, sigma=0.0)
-    assert float((block.accel - without.accel).abs().max()) > 1e-3, "the effect does something here"
+    shown = block.speed if cls.reading == "speed" else block.accel
+    bare = without.speed if cls.reading == "speed" else without.accel
+    assert float((shown - bare).abs().max()) > 1e-3, "the effect does something here"
     response = car.response(drive_of(block))
     # the first row is the loop's own, not the sensor's
     torch.testing.assert_close(response.accel_measured[1:], block.accel[0, 1:], rtol=0, atol=1e-9)
-    torch.testing.assert_close(response.speed, block.speed[0], rtol=0, atol=1e-9)
+    torch.testing.assert_close(response.speed_measured, block.speed[0], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -206,7 +209,7 @@ def test_gradients(cls: type[Effect], start: str) -> None:
 
     def outputs(*given: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         r = car.response(drive, dict(zip(names, given, strict=True)))
-        return r.accel_measured[..., ::7], r.speed[..., ::7]
+        return r.accel_measured[..., ::7], r.speed_measured[..., ::7]
 
     assert torch.autograd.gradcheck(outputs, tuple(values.values()), eps=1e-7, atol=2e-6, rtol=1e-4)
 
@@ -303,13 +306,17 @@ def test_sensor_faults_leave_the_car_alone() -> None:
         assert torch.equal(out.accel, plain.accel)
         assert not torch.equal(out.accel_measured, plain.accel_measured)
     torch.testing.assert_close(plant([gap.SensorBias(0.1)]).response(drive).accel_measured, plain.accel + 0.1)
+    late = plant([gap.SpeedSensorLag(0.2)]).response(drive)
+    assert torch.equal(late.accel_measured, plain.accel)
+    assert torch.equal(late.speed, plain.speed)
+    assert not torch.equal(late.speed_measured, plain.speed)
 
 
 def test_speed_is_needed_where_it_counts() -> None:
     time = torch.arange(30, dtype=D) * 0.1
     drive = SimulatorInput(time, torch.ones_like(time))
     for cls in EVERY:
-        if cls.needs_speed:
+        if cls.needs_speed and cls.reading == "accel":
             with pytest.raises(InputError, match="speed"):
                 filled(plant([cls])).response(drive)
         else:

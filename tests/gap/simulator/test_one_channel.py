@@ -40,10 +40,10 @@ def test_untested_effects_are_reported() -> None:
     assert all(is_observable(e, BOTH) for e in EFFECTS.values())
     assert not_observable(BOTH, EFFECTS.values()) is None
     unseen = {e.name for e in EFFECTS.values() if not is_observable(e, SPEED)}
-    assert unseen == {"outliers", "sensor_bias", "sensor_lag", "sensor_scale"}
+    assert unseen == {"outliers", "sensor_bias", "sensor_lag", "sensor_scale", "speed_lag"}
     said = not_observable(SPEED, EFFECTS.values())
     assert said is not None
-    assert said.endswith("outliers, sensor_bias, sensor_lag, sensor_scale.")
+    assert said.endswith("outliers, sensor_bias, sensor_lag, sensor_scale, speed_lag.")
     said = not_observable(ACCEL, EFFECTS.values())
     assert said is not None
     for name in ("aerodynamic_drag", "gear_shift", "low_speed_creep", "road_grade", "speed_dependent_lag"):
