@@ -35,13 +35,13 @@ from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.simulators import read_simulator, refuse_loop, simulator_of
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError, quoted
-from avtorch.gap.result.traces import Alarm
 from avtorch.io import Log
 from avtorch.io.opening import place, read_regular
 from avtorch.numeral import numeral
 
 if TYPE_CHECKING:
     from avtorch.experiment import Limits
+    from avtorch.gap.result.traces import Alarm
     from avtorch.io import Log
 
 TRACK = Group("Next experiment", sort_key=20)
@@ -425,6 +425,8 @@ def _answer(path: Path) -> Mapping[str, Any]:
 
 
 def _alarms(answer: Mapping[str, Any], path: Path, log: Log, number: int) -> list[Alarm]:
+    from avtorch.gap.result.traces import Alarm
+
     try:
         rows, epoch = int(answer["quality"]["rows"]), float(answer["epoch_s"])
         windows = [(float(w["end_s"]), frozenset(map(str, w["alerts"]))) for w in answer["windows"]]

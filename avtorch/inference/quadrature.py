@@ -139,7 +139,7 @@ def integrate(density: Density, *, mode: Mode | None = None, nodes: int = 49, to
     Example:
         >>> from avtorch.inference import integrate
         >>> from avtorch.validation import synthetic_windows
-        >>> exact = integrate(synthetic_windows(1, seed=1).density, nodes=25)
+        >>> exact = integrate(synthetic_windows(1, seed=1).density)
         >>> exact.names, exact.converged.item()
         (('T_L', 'K_L', 'sigma'), True)
     """
