@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,6 @@ from avtorch.live import (
     Stop,
     watch_source,
 )
-from avtorch.live import watch_source as kept_cars_module
 from tests.live.drives import fleet, lines
 
 CHUNK = 997  # bytes, so that batches end in the middle of rows and windows
@@ -93,7 +93,7 @@ def test_stopped_again_and_again_it_writes_what_an_uncut_one_writes(tmp_path: Pa
 
 def test_killed_it_writes_each_window_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """States are written at any time before a crash; here after every batch, of the car whose turn it is."""
-    monkeypatch.setattr(kept_cars_module, "EVERY_S", 0.0)
+    monkeypatch.setattr(sys.modules["avtorch.live.watch_source"], "EVERY_S", 0.0)
     monkeypatch.setattr("avtorch.live.line_source.CHUNK", 10 * CHUNK)  # a batch costs two files
     (tmp_path / "rows.jsonl").write_bytes(lines(fleet(12.0)))
     out = tmp_path / "out.jsonl"
