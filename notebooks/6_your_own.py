@@ -71,7 +71,7 @@ print(f"neutral against none: {error:.1e} m/s²; bent against none: {float((bent
 # %% [markdown]
 # ## The effect diagnosed
 #
-# A minute of driving with it. Then the diagnosis, with the class as one more hypothesis beside the 24.
+# A minute of driving with it. Then the diagnosis, with the class as one more hypothesis beside the table.
 
 # %%
 car = plant([PedalMap(0.4)], baseline="T_L=0.4, K_L=0.9", sigma=0.1)

@@ -1,4 +1,4 @@
-"""The causes that a case may contain: the 24 effects of the table, and families outside the table.
+"""The causes that a case may contain: the effects of the table, and families outside the table.
 
 A cause is drawn for a car and a drive, all but its strength, which scales it: 1 is the middle of what cars have, 0 no
 effect, `strongest` the upper limit. Families outside the table are split permanently: those in `CALIBRATION` may serve
