@@ -248,6 +248,7 @@ def ecdf_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
                 arviz().plot_ecdf(
                     values,
                     cdf=uniform.cdf,
+                    rvs=uniform().rvs,
                     eval_points=np.linspace(0.01, 0.99, 99),
                     difference=True,
                     confidence_bands="simulated",

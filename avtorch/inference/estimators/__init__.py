@@ -3,9 +3,9 @@ squares and joint Kalman filters."""
 
 from avtorch.inference.estimators.choose import ESTIMATORS, make_estimator
 from avtorch.inference.estimators.kalman import JointEKF, JointUKF
+from avtorch.inference.estimators.other_posteriors import ImportanceSampling, MaximumAPosteriori
 from avtorch.inference.estimators.rls import RecursiveLeastSquares
 from avtorch.inference.estimators.windowed import Estimator
-from avtorch.inference.sequential import ImportanceSampling, MaximumAPosteriori
 
 __all__ = [
     "ESTIMATORS",

@@ -7,10 +7,11 @@ from typing import Any
 
 from avtorch.errors import InputError
 from avtorch.inference.estimators.kalman import JointEKF, JointUKF
+from avtorch.inference.estimators.other_posteriors import ImportanceSampling, MaximumAPosteriori
 from avtorch.inference.estimators.rls import RecursiveLeastSquares
 from avtorch.inference.estimators.windowed import Estimator, WindowedEstimator
 from avtorch.inference.form import Form
-from avtorch.inference.sequential import ImportanceSampling, MaximumAPosteriori, SequentialInference
+from avtorch.inference.sequential import SequentialInference
 
 ESTIMATORS: dict[str, type[SequentialInference] | type[WindowedEstimator]] = {
     "sgld": SequentialInference,
