@@ -89,6 +89,7 @@ def by_nuts(y: FloatArray, sd: FloatArray, seed: int, *, centred: bool) -> Float
 def by_walnuts(y: FloatArray, sd: FloatArray, seed: int, *, centred: bool) -> FloatArray:
     import walnutpie
 
+    np.seterr(all="ignore")  # a step too far overflows, and is refused
     rate, precision = 2 / SPREAD, sd**-2.0
 
     def density(z: FloatArray) -> tuple[float, FloatArray]:

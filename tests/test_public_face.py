@@ -42,7 +42,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 def test_import_is_light() -> None:
     code = (
         "import sys, avtorch, avtorch.cli;"
-        "print(*[m for m in ('torch', 'matplotlib', 'pyarrow', 'scipy', 'pyro', 'arviz') if m in sys.modules])"
+        "print(*[m for m in ('numpy', 'torch', 'matplotlib', 'pyarrow', 'scipy', 'pyro', 'arviz') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []

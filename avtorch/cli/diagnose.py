@@ -35,8 +35,6 @@ from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.simulators import read_simulator, refuse_loop, simulator_of
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError, quoted
-from avtorch.io import Log
-from avtorch.io.opening import place, read_regular
 from avtorch.numeral import numeral
 
 if TYPE_CHECKING:
@@ -414,6 +412,8 @@ def read_alarms(paths: Sequence[Path], logs: Sequence[Log]) -> tuple[Alarm, ...]
 
 
 def _answer(path: Path) -> Mapping[str, Any]:
+    from avtorch.io.opening import place, read_regular
+
     try:
         found = json.loads(read_regular(path, most=_MOST_BYTES, need=_NEED).decode("utf-8"))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as fault:
@@ -426,6 +426,7 @@ def _answer(path: Path) -> Mapping[str, Any]:
 
 def _alarms(answer: Mapping[str, Any], path: Path, log: Log, number: int) -> list[Alarm]:
     from avtorch.gap.result.traces import Alarm
+    from avtorch.io.opening import place
 
     try:
         rows, epoch = int(answer["quality"]["rows"]), float(answer["epoch_s"])
