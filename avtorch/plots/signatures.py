@@ -50,10 +50,10 @@ def standard_response(effect: Effect | None, *, seed: int = _SEED) -> Response:
 
 
 def effect_signature(ax: Axes, effect: Effect, *, seed: int = _SEED) -> Axes:
-    """Plot the measured acceleration [m/s²], of an effect on the speed that speed's slope, with `effect` and without,
-    over the standard command.
+    """Plot the measured acceleration [m/s²] with `effect` and without, over the standard command.
 
-    Below them lies the gap, magnified by the factor that is written there.
+    Of an effect on the measured speed it is that speed's slope. Below lies the gap, magnified by the factor that is
+    written there.
 
     Example:
         >>> from matplotlib.figure import Figure

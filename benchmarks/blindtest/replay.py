@@ -126,7 +126,9 @@ class Replay:
     ) -> Response:
         """Rows of the readings: those of the drive's own speed, and what the simulated motion differs from it."""
         gained = np.concatenate([[0.0], np.cumsum(0.5 * STEP_S * (accels[1:] + accels[:-1]))])
-        rows = len(self.run.time)
+        rows, begin = len(self.run.time), first * per_row
+        for late in filters(effects, float(gained[begin]), speed=True):
+            gained[begin:] = [late(y) for y in gained[begin:].tolist()]
         # the vehicle's own arguments, so that its roads and phases come out alike
         seconds = rows * per_row * STEP_S
         without = Readings({}, self._stream, reach=reach, seconds=seconds, onset=self.onset)

@@ -409,4 +409,4 @@ def test_notes(logs: list[Log], printed: Callable[[Diagnosis], list[str]]) -> No
     )
     many = Candidate("dead_time", 0.3, 9.0), *(Candidate(n, 0.05, 1.0) for n in sorted(EFFECTS) if n != "dead_time")
     told = noted(answer(logs, (*many, *CANDIDATES[-2:])))
-    assert told[0].endswith("command_hold or any of 19 less probable hypotheses.")
+    assert told[0].endswith("command_hold or any of 20 less probable hypotheses.")

@@ -17,10 +17,10 @@ from avtorch.plots.signatures import effect_signature, signature_figure, standar
 )
 def test_every_effect_has_a_signature(cls: type[Effect]) -> None:
     effect = cls(change_s=9.0) if cls.name == "gain_change" else cls()
-    gap = standard_response(effect).accel_measured - standard_response(None).accel_measured
-    assert float(gap.abs().max()) > 0.005
-    neutral = standard_response(cls.neutral()).accel_measured - standard_response(None).accel_measured
-    assert float(neutral.abs().max()) < 1e-12
+    shown = "speed_measured" if cls.reading == "speed" else "accel_measured"
+    with_it, neutral, without = (getattr(standard_response(e), shown) for e in (effect, cls.neutral(), None))
+    assert float((with_it - without).abs().max()) > 0.005
+    assert float((neutral - without).abs().max()) < 1e-12
 
 
 def test_drawing_takes_an_axes() -> None:
