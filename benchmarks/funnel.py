@@ -89,9 +89,9 @@ def by_nuts(y: FloatArray, sd: FloatArray, seed: int, *, centred: bool) -> Float
 def by_walnuts(y: FloatArray, sd: FloatArray, seed: int, *, centred: bool) -> FloatArray:
     import walnutpie
 
-    np.seterr(all="ignore")  # a step too far overflows, and is refused
     rate, precision = 2 / SPREAD, sd**-2.0
 
+    @np.errstate(all="ignore")  # a step too far overflows, and is refused
     def density(z: FloatArray) -> tuple[float, FloatArray]:
         mean, between = z[0], np.exp(z[1])
         away = (z[2:] - mean) / between if centred else z[2:]
