@@ -120,6 +120,8 @@ def line(name: str, log: Log) -> str:
             assert log.speed is not None
             inputs = {name: x[run] for name, x in given.items() if x is not None}
             errors.append(free_run(fit.map, inputs, log.speed[run], warm, dt))
+    if not errors:
+        raise InputError("no run of a third of the time or more on what taught nothing")
     cells = [name, f"{len(errors)}", f"{np.sqrt(np.mean(np.concatenate(errors) ** 2)):.3f}"]
     cells += [f"{fit.map.T_L:.2f}", f"{fit.map.dead_time:.2f}", f"± {fit.late_sd:.2f}", f"{seconds:.0f} s"]
     return f"| {' | '.join(cells)} |"

@@ -29,7 +29,7 @@ _LAST_DIGIT = 0.001  # of an acceleration in a table, m/s²
 _DRIVING = ("throttle", "torque", "current")
 _HEADER = ("pedal", "value", "speed", "accel", "sd")
 _NUMBER = {"coasting": 0, "throttle": 1, "brake": 2, "torque": 3, "current": 4, ERROR: 7, RATE: 8}
-_LAG, _DELAY = 5, 6
+_LAG, _DELAY, _DRIVEN = 5, 6, 9
 """Which quantity a row is of; numbers, so that the file is a table like others."""
 
 
@@ -106,6 +106,9 @@ def _table(made: PedalMap, names: Sequence[str], side: float) -> MapTable | None
         is_share = unit_of(name, values[-1]) == "-"
         share = values if is_share else values / values[-1]
         lost = [f"lag {made.T_L:.3g} s and dead time {made.dead_time:.3g} s"]
+        if made.driven is not None and not (made.driven[0] <= made.speed[0] and made.speed[-1] <= made.driven[1]):
+            slowest, fastest = made.driven
+            lost.append(f"that only {slowest:.3g} to {fastest:.3g} m/s were driven; beyond, it goes on along a line")
         if not is_share:
             unit = unit_of(name, values[-1])
             lost.append(f"the unit of {name}: a pedal of 1 is {values[-1]:.6g} {unit}")
@@ -163,7 +166,7 @@ def write_map(made: PedalMap, folder: str | PathLike[str]) -> list[Path]:
 
 def _text(made: PedalMap) -> str:
     words = ", ".join(f"{number} {name}" for name, number in _NUMBER.items())
-    words += f", {_LAG} lag [s], {_DELAY} delay [s]"
+    words += f", {_LAG} lag [s], {_DELAY} delay [s], {_DRIVEN} speeds driven [m/s], lowest as value, highest as speed"
     lines = [f"# pedal: {words}; value in {_units(made)}; speed [m/s]; accel and sd [m/s2]", ",".join(_HEADER)]
     tables = {"coasting": PedalTable(np.zeros(1), made.coasting[None], _row(made.coasting_sd)), **made.pedals}
     for name, table in tables.items():
@@ -173,6 +176,8 @@ def _text(made: PedalMap) -> str:
                 lines.append(f"{_NUMBER[name]},{x!r},{v!r},{a!r},{e!r}")
     for number, seconds in ((_LAG, made.T_L), (_DELAY, made.dead_time)):
         lines.append(f"{number},{float(seconds)!r},0,0,0")
+    if made.driven is not None:
+        lines.append(f"{_DRIVEN},{float(made.driven[0])!r},{float(made.driven[1])!r},0,0")
     return "\n".join(lines) + "\n"
 
 
@@ -215,7 +220,9 @@ def read_map(path: str | PathLike[str]) -> PedalMap:
     coasting = found.pop("coasting")
     T_L, dead_time = (float(value[kind == number][0]) for number in (_LAG, _DELAY))
     assert coasting.sd is not None
-    return PedalMap(at, coasting.accel[0], found, T_L, dead_time, coasting.sd[0])
+    row = kind == _DRIVEN
+    driven = (float(value[row][0]), float(speed[row][0])) if row.any() else None
+    return PedalMap(at, coasting.accel[0], found, T_L, dead_time, coasting.sd[0], driven)
 
 
 def _unfit(table: Table, name: str) -> InputError:

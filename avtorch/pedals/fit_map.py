@@ -156,7 +156,7 @@ def _loop_map(drive: PedalDrive, fit: Fit, dead_time: float) -> PedalMap:
     spans = {name: (float(x.min()), float(x.max())) for name, x in drive.pedals.items()}
     u = np.unique(np.concatenate([rows.knots_u, [0.0], spans[ERROR]]))
     made = tabulated(
-        PedalCommand({ERROR: 1.0}, spans, (0.0, 0.0)),
+        PedalCommand({ERROR: 1.0}, spans, (float(drive.speed.min()), float(drive.speed.max()))),
         u,
         rows.knots_v,
         np.stack([np.interp(u, rows.knots_u, x) for x in at.table.T], 1) + at.curve,

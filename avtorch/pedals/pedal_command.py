@@ -103,4 +103,4 @@ def tabulated(
         at = SIGN[name] * u[order] / factor
         kept = (at >= min(low, 0.0) - 1e-9) & (at <= high + 1e-9)
         pedals[name] = PedalTable(at[kept], force[order[kept]] - force[zero])
-    return PedalMap(v, force[zero], pedals, T_L, dead_time)
+    return PedalMap(v, force[zero], pedals, T_L, dead_time, driven=command.speed)

@@ -341,13 +341,14 @@ def force_contours(ax: Axes, found: Diagnosis) -> Axes:
     middle = [0.5 * (x[1:] + x[:-1]) for x in (across, along)]
     ax.contourf(*middle, (~driven).T.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
     ax.axhline(0.0, color=GREY, lw=0.8)
-    ax.set(xlabel="speed [m/s]", ylabel="command [m/s²]", xlim=(v[0], v[-1]), ylim=(u[0], u[-1]))
+    ax.set(xlabel="speed [m/s]", ylabel="command [m/s²]", xlim=across[[0, -1]], ylim=along[[0, -1]])
     ax.grid(visible=False)
     return ax
 
 
 def resistance_line(ax: Axes, found: Diagnosis) -> Axes:
-    """The resistance of the free form [m/s²] over speed, and where the middle nine tenths of the drive lie.
+    """The resistance of the free form [m/s²] over speed, and where the middle nine tenths of the drive lie; where
+    nothing was driven it is a line.
 
     Raises `InputError` without a resistance.
     """
@@ -368,10 +369,14 @@ def driven_cells(found: Diagnosis) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Edges of cells in speed [m/s] and command [m/s²], and whether the drive was in each (speed, command)."""
     form, traces = found.free_form, found.traces
     assert form is not None
-    edges = [np.linspace(x[0], x[-1], _CELLS + 1) for x in (form.knots_v, form.knots_u)]
-    if traces is None or traces.speed is None:
+    ends = [form.knots_v[[0, -1]], form.knots_u[[0, -1]]]
+    speed = None if traces is None else traces.speed
+    if speed is not None:
+        ends[0] = np.clip([speed.min(), speed.max()], *ends[0])
+    edges = [np.linspace(low, high, _CELLS + 1) for low, high in ends]
+    if traces is None or speed is None:
         return edges[0], edges[1], np.ones((_CELLS, _CELLS), bool)
-    counts = np.histogram2d(traces.speed, traces.command, bins=edges)[0]
+    counts = np.histogram2d(speed, traces.command, bins=edges)[0]
     return edges[0], edges[1], counts > 0
 
 

@@ -26,7 +26,7 @@ _UNITS = {
 def pedal_lines(ax: Axes, made: PedalMap, pedal: str, *, lines: int = 4) -> Axes:
     """The acceleration that one pedal demands, the others at rest; likewise a commanded speed's error, and its slope.
 
-    Lines are at some speeds between the slowest and the fastest that the map knows; bands are one standard error, by
+    Lines are at some speeds between the slowest and the fastest that were driven; bands are one standard error, by
     blocks of the drive, of what the pedal adds.
     """
     table = made.pedals[pedal]
@@ -34,7 +34,9 @@ def pedal_lines(ax: Axes, made: PedalMap, pedal: str, *, lines: int = 4) -> Axes
         scale, unit = (100.0, "%") if float(np.abs(table.pedal).max()) <= 1.2 else (1e-5, "bar")
     else:
         scale, unit = _UNITS[pedal]
-    rows = np.unique(np.linspace(0, len(made.speed) - 1, lines).round().astype(int))
+    low, high = made.driven or (made.speed[0], made.speed[-1])
+    driven = np.flatnonzero((made.speed >= low) & (made.speed <= high))
+    rows = np.unique(driven[np.linspace(0, len(driven) - 1, lines).round().astype(int)])
     for colour, row in zip(_COLOURS, rows, strict=False):
         level = made.coasting[row] + table.accel[:, row]
         ax.plot(scale * table.pedal, level, color=colour, marker=".", label=f"{made.speed[row]:.3g} m/s")

@@ -195,17 +195,22 @@ def _free_form(found: Diagnosis) -> Picture | None:
         return None
     u, v = form.knots_u, form.knots_v
     columns, rows, says = ["speed [m/s]"], v[:, None], []
+    across, _, cells = drawings.driven_cells(found)
+    low, high = across[[0, -1]]
     if form.sizes.table > 0:
-        driven = drawings.driven_cells(found)[2].mean()
         says.append(
-            f"Contours of the force beyond K u over speed, {v[0]:.3g} to {v[-1]:.3g} m/s, and command, {u[0]:.2g} to "
-            f"{u[-1]:.2g} m/s²: {form.at.table.min():.2g} to {form.at.table.max():.2g} m/s²; {100 * driven:.0f} % of "
-            "the cells were driven."
+            f"Contours of the force beyond K u over speed, {low:.3g} to {high:.3g} m/s, and command, {u[0]:.2g} to "
+            f"{u[-1]:.2g} m/s²: {form.at.table.min():.2g} to {form.at.table.max():.2g} m/s²; {100 * cells.mean():.0f} "
+            "% of the cells were driven."
         )
         columns += [f"force beyond K u at {x:.2g} m/s² [m/s²]" for x in u]
         rows = np.column_stack([rows, form.at.table.T])
     if form.sizes.resistance > 0:
-        says.append(f"A line of the resistance: {form.at.curve.min():.2g} to {form.at.curve.max():.2g} m/s².")
+        curve = np.interp(across, v, form.at.curve)
+        says.append(
+            f"A line of the resistance, at the speeds driven {curve.min():.2g} to {curve.max():.2g} m/s²; at others it "
+            "goes on along a line."
+        )
         columns.append("resistance [m/s²]")
         rows = np.column_stack([rows, form.at.curve])
     return picture_of(

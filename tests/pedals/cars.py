@@ -24,6 +24,11 @@ def with_dead_zone(throttle: np.ndarray, brake: np.ndarray, speed: np.ndarray) -
     return plain(np.clip(throttle - DEAD_ZONE, 0, None), brake, speed) - 0.0008 * speed**2
 
 
+def with_motor_brake(throttle: np.ndarray, brake: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    """A motor whose current falls with its speed, as that of a small electric car does."""
+    return 12.0 * throttle - 8.0 * brake - 0.3 * speed
+
+
 def factors(throttle: np.ndarray, brake: np.ndarray, speed: np.ndarray) -> np.ndarray:
     """One constant a pedal, and nothing else."""
     return 5.0 * throttle - 8.0 * brake + 0.0 * speed

@@ -20,6 +20,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     back = read_map(files[0])
     assert back.T_L == made.T_L
     assert back.dead_time == made.dead_time
+    assert back.driven == made.driven
     assert np.array_equal(back.coasting, made.coasting)
     for name, table in made.pedals.items():
         assert np.array_equal(back.pedals[name].pedal, table.pedal)

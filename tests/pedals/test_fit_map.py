@@ -8,7 +8,7 @@ import pytest
 from avtorch.errors import InputError
 from avtorch.io import Log
 from avtorch.pedals import PedalFit, fit_pedals
-from tests.pedals.cars import DEAD_ZONE, DELAY_S, LAG_S, drive, plain, with_dead_zone
+from tests.pedals.cars import DEAD_ZONE, DELAY_S, LAG_S, drive, plain, with_dead_zone, with_motor_brake
 
 SEEDS = (11, 12)
 
@@ -59,6 +59,24 @@ def test_a_dead_zone_is_found_on_a_calm_day(seed: int) -> None:
     slope = np.diff(table.accel, axis=0) / np.diff(table.pedal)[:, None]
     inside, beyond = table.pedal[1:] <= DEAD_ZONE, table.pedal[:-1] >= DEAD_ZONE
     assert slope[inside].mean() < 0.5 * slope[beyond].mean()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_where_nothing_was_driven_resistance_goes_on_along_a_line(seed: int) -> None:
+    log = drive(with_motor_brake, seed)
+    assert log.speed is not None
+    made = fit_pedals(log).map
+    assert made.driven == pytest.approx(
+        (log.speed.min(), log.speed.max()), abs=0.15
+    )  # of means over a tenth of a second
+    last, furthest = np.searchsorted(made.speed, made.driven[1]) - 1, len(made.speed) - 1
+    assert furthest > last
+    assert made.coasting_sd is not None
+    fell = made.coasting[furthest] - made.coasting[last]
+    true = -0.3 * (made.speed[furthest] - made.speed[last])
+    error = np.hypot(*made.coasting_sd[[last, furthest]])
+    assert abs(fell - true) < 4 * error
+    assert abs(fell - true) < abs(true)  # nearer than a curve that is held
 
 
 def test_the_fit_is_the_same_every_time() -> None:

@@ -1,10 +1,11 @@
 r"""The free form of a repaired simulator: what the car's force does beyond K u, fitted to free runs.
 
-    F ~ N(0, (z_F A)^2 [k(u) + k(u) k(v) / 2]),    R ~ N(0, (z_R A)^2 [1 + v v' + k(v)])
+    F ~ N(0, (z_F A)^2 [k(u) + k(u) k(v) / 2]),    R ~ N(0, A^2 [L^2 (1 + v v') + z_R^2 k(v)])
 
 at the knots of command and speed, k the Matern-3/2 kernel of length one standard deviation of what was driven, A the
-standard deviation of the acceleration (Rasmussen and Williams 2006, 2 and 4.2). Where nothing was driven the table goes
-back to K u, and the resistance to a line. With given sizes z the coefficients minimise
+standard deviation of the acceleration (Rasmussen and Williams 2006, 2 and 4.2). The resistance's line is vague, since
+a size that is shrunk here is wrong there (2.7): at speeds that were not driven, for which there are knots too, the
+table goes back to K u, and the resistance to that line. With given sizes z the coefficients minimise
 
     n ln(mean squared error of the speed in free runs) + b' C^-1 b,    n = taught seconds / `INDEPENDENT_S`
 
@@ -50,9 +51,12 @@ GAIN_SD = 1.0
 """Standard deviation of the gain beside a free form, about the evidence's [-]: a nominal command's unit is open."""
 SIZES = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Relative sizes z that are tried [-]."""
+LINE_SIZE = max(SIZES)
+"""Relative size L of a resistance's line over one standard deviation of the speed [-]: vague."""
 _U_QUANTILES = (0.005, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 0.995)
 _V_QUANTILES = (0.002, 0.08, 0.25, 0.5, 0.75, 0.92, 0.998)
 _APART = 0.12  # standard deviations between knots, least
+_BEYOND = (1.0, 3.0)  # standard deviations of the speed, from what was driven to further knots
 _BLOCK_S = (4.0, 10.0)  # shortest and longest block
 _BLOCKS = 10  # aimed at in short drives
 _FOLDS = 10
@@ -188,8 +192,11 @@ class Car:
 
 
 def knots_of(command: FloatArray, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where the table is told: knots of commands and of speeds, where they were driven."""
-    return _knots(command, _U_QUANTILES, zero=True), _knots(speed, _V_QUANTILES)
+    """Where the table is told: knots of commands where they were driven, of speeds also beyond."""
+    driven, spread = _knots(speed, _V_QUANTILES), float(speed.std())
+    slower = [v for far in reversed(_BEYOND) if (v := driven[0] - far * spread) > 0]
+    faster = [driven[-1] + far * spread for far in _BEYOND]
+    return _knots(command, _U_QUANTILES, zero=True), np.array([*slower, *driven, *faster])
 
 
 def _arriving(h: Hypothesis, car: GapPlant, source: IntArray, step: float) -> FloatArray:
@@ -248,10 +255,11 @@ class Prior:
         along_v = _matern(z)
         scale = max(float(np.diff(v)[~rows.starts[1:]].std()) / rows.dt, 1e-3)
         table = np.kron(along_u, np.ones_like(along_v)) + 0.5 * np.kron(along_u, along_v)
-        curve = 1.0 + np.outer(z, z) + along_v
-        always = np.kron(np.outer(rows.knots_u, rows.knots_u), car.steep**2 + car.slope**2 * np.outer(z, z))
+        line = LINE_SIZE * scale if sizes.resistance > 0 else 0.0
+        straight = line**2 * (1.0 + np.outer(z, z))
+        gains = np.kron(np.outer(rows.knots_u, rows.knots_u), car.steep**2 + car.slope**2 * np.outer(z, z))
         blocks, moves = [], []
-        for covariance, size, free in ((table, sizes.table, always), (curve, sizes.resistance, 0 * along_v)):
+        for covariance, size, free in ((table, sizes.table, gains), (along_v, sizes.resistance, straight)):
             whole = (size * scale) ** 2 * covariance + free
             moves += [bool(whole.any())] * len(whole)
             if moves[-1]:
