@@ -57,6 +57,7 @@ _FINE_MPS = 0.02  # resolution of its place
 _DISTINCT_MPS = 0.05  # smaller dips of the speed are noise
 _MOST_HYSTERESIS_MPS = 4.0  # a gear that has not changed back by then never does
 _PLACES = 8  # hystereses tried at once
+_FINISHED = 3  # fits of each pass
 _LEAST_DEPTH = 0.05  # a level that does nothing cannot be placed
 _TOGETHER = ("T_L", "K_L", "shift_depth", "shift_duration")  # fitted with speeds
 _LEAST_NATS = 0.5  # a change that gains less is none
@@ -88,19 +89,22 @@ def refined_shift_speeds(h: Hypothesis) -> Hypothesis:
     gains."""
     best = h
     for _ in range(_PASSES):
-        begun = _rearmed(best)
-        shifts = _Shifts(begun)
-        moved = shifts.ascend()
-        if not shifts.levels or not (moved or begun is not best or best is h):
-            break
-        new = begun.copy()
-        new.shift_speeds = np.array(sorted(shifts.levels))
-        new["shift_depth"], new["shift_duration"] = shifts.depth, shifts.duration
-        new = _pruned(fit_with_speeds(new))
+        starts = sorted(_rearmed(best), key=_objective)[-_FINISHED:]
+        new = max((_pruned(fit_with_speeds(x)) for x in starts), key=_objective)
         if _objective(new) <= _objective(best) + _LEAST_NATS:
             break
         best = new
     return best
+
+
+def _moved(h: Hypothesis) -> Hypothesis | None:
+    """The hypothesis with levels moved, dropped and added; None where that changes nothing or leaves none."""
+    shifts, new = _Shifts(h), h.copy()
+    if not shifts.ascend() or not shifts.levels:
+        return None
+    new.shift_speeds = np.array(sorted(shifts.levels))
+    new["shift_depth"], new["shift_duration"] = shifts.depth, shifts.duration
+    return new.evaluate()
 
 
 def _pruned(h: Hypothesis) -> Hypothesis:
@@ -113,8 +117,9 @@ def _pruned(h: Hypothesis) -> Hypothesis:
     return h
 
 
-def _rearmed(h: Hypothesis) -> Hypothesis:
-    """The hypothesis with the best hysteresis; `h` where none gains.
+def _rearmed(h: Hypothesis) -> list[Hypothesis]:
+    """The hypothesis with other hystereses, each with its levels as they are and moved: one may be wrong by what the
+    other is.
 
     Between two depths to which the speed dips below a level and comes back, all hystereses are the same. Too small
     ones add upshifts and too large ones leave some out, so the likelihood rises up to the true one and falls behind it:
@@ -125,21 +130,23 @@ def _rearmed(h: Hypothesis) -> Hypothesis:
     edges = np.unique(np.concatenate([[_DISTINCT_MPS, _MOST_HYSTERESIS_MPS], *dips]))
     edges = edges[(edges >= _DISTINCT_MPS) & (edges <= _MOST_HYSTERESIS_MPS)]
     values = 0.5 * (edges[1:] + edges[:-1])
-    best, tried = h, set[int]()
+    best, tried, out = h, set[int](), [h]
     first, last = 0, len(values) - 1
     while True:
         places = sorted(set(np.linspace(first, last, _PLACES).round().astype(int).tolist()) - tried)
         for k in places:
             new = h.copy()
             new["shift_hysteresis"] = float(values[k])
-            if new.evaluate().log_likelihood > best.log_likelihood + _LEAST_NATS:
-                best = new
+            out.append(new.evaluate())
+            best = max(best, new, key=_objective)
         tried |= set(places)
         near = int(np.abs(values - best["shift_hysteresis"]).argmin())
         left, right = [k for k in tried if k < near], [k for k in tried if k > near]
         first, last = max(left, default=0), min(right, default=len(values) - 1)
         if not places or set(range(first, last + 1)) <= tried:
-            return best
+            break
+    likely = [best, *out[: _PLACES + 1]]
+    return [*likely, *(x for x in map(_moved, likely) if x is not None)]
 
 
 def fit_with_speeds(h: Hypothesis, iterations: int = 6) -> Hypothesis:
