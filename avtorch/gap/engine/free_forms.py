@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -102,6 +102,9 @@ def families(h: Hypothesis) -> dict[str, FreeForm]:
         ("sided", "dynamics"): [("u > 0", up, lag) for lag in (short, long, longest, own)],
     }
     forms = {name: _form(h, name, family, each) for (name, family), each in demands.items()}
+    # a gain by sign is a force map: at rest, lags by sign change nothing
+    *others, car = forms["sided"].columns
+    forms["sided"] = replace(forms["sided"], columns=np.array(others) - car, terms=forms["sided"].terms[:-1])
     if h.force is None and (maps := map_forms(h.data)):
         forms["map"] = map_free_form(h, maps[-1])
     return forms
