@@ -27,6 +27,11 @@ if TYPE_CHECKING:
     from avtorch.gap.result.diagnosis import Diagnosis
 
 
+NO_WORKER_S = 60.0
+"""Without a worker after which a fleet ends [s]: a process starts within ten, also on a busy machine."""
+_POLL_S = 0.05
+
+
 @dataclass(frozen=True)
 class Task:
     """A `step` for the log at `place` with this content; `size` [bytes]; a `name` that no other task of the run has.
@@ -143,7 +148,8 @@ def worked_off(cluster: Cluster, tasks: Sequence[Task]) -> Iterator[tuple[Task, 
     A task whose worker ends is done again by another one. After `ATTEMPTS` times (or as often as the scheduler of
     another cluster allows) all that is left of its log waits for the end, where nothing else runs beside it: Dask
     suspects every task that a worker had when it ended. If its workers end as often again, its outcome is a row that
-    says so, and the log's later steps are not tried. Raises `InputError` where the scheduler is lost.
+    says so, and the log's later steps are not tried. Raises `InputError` where the scheduler is lost, or no worker
+    comes back.
     """
     from distributed import as_completed
 
@@ -171,7 +177,7 @@ def worked_off(cluster: Cluster, tasks: Sequence[Task]) -> Iterator[tuple[Task, 
                     futures.add(future)
             if not running:
                 continue
-            done, result = next(futures)
+            done, result = _next(futures, cluster)
             task, future = running.pop(done.key)
             if done.status == "finished":
                 yield task, result
@@ -190,6 +196,22 @@ def worked_off(cluster: Cluster, tasks: Sequence[Task]) -> Iterator[tuple[Task, 
     finally:
         for _, future in running.values():
             future.release()
+
+
+def _next(futures: Any, cluster: Cluster) -> tuple[Any, Any]:
+    """The next (future, result), waited for as long as a local cluster has workers; another one may begin some."""
+    seen = time.monotonic()
+    while not futures.has_ready():
+        time.sleep(_POLL_S)
+        now = time.monotonic()
+        if not cluster.local or cluster.client.scheduler_info()["workers"]:
+            seen = now
+        elif now - seen > NO_WORKER_S:
+            raise InputError(
+                f"memory: no worker has come back for {NO_WORKER_S:.0f} s within {cluster.limit}, needs more, such as "
+                "2GiB; what was done is kept"
+            )
+    return next(futures)
 
 
 def _order(task: Task) -> int:

@@ -31,7 +31,7 @@ def test_a_weak_brake_and_a_delay_are_found_although_a_driver_took_over(rotating
     # five of its own standard deviations; the loop around the speed adds a millisecond
     assert ratio.mean == pytest.approx(RATIO, abs=BAR * ratio.sd)
     assert delay.mean == pytest.approx(DELAY, abs=BAR * delay.sd + 0.001)
-    assert delay.sd < 0.01
+    assert delay.sd < 0.0125  # that of a recorder's delay, of which it cannot be told: 7.5 and 10 ms
     # a drive with overrides is one drive: blocks of it are held out, not the parts between overrides
     assert found.log.segments == 1
     assert found.shrinkage is not None
