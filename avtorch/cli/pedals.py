@@ -39,12 +39,13 @@ def map_sentence(fit: PedalFit) -> str:
     """What stands for the command, how good it is, and what it cannot tell."""
     made, score = fit.map, fit.held_out
     slowest, fastest = made.driven or (made.speed[0], made.speed[-1])
+    at_others = "is held" if "speed_error" in made.pedals else "goes on along a line"
     ranges = [f"{name} {_range(name, table.pedal)}" for name, table in made.pedals.items()]
     worth = "better" if score.better_than("factor") else "not surely better"
     names = " and ".join(made.pedals)
     said = (
         f"The log has no accel_cmd: a map of {names} and speed stands for it ({', '.join(ranges)}, speed "
-        f"{slowest:.3g} to {fastest:.3g} m/s; at others it goes on along a line). On blocks left out its free runs of "
+        f"{slowest:.3g} to {fastest:.3g} m/s; at others it {at_others}). On blocks left out its free runs of "
         f"{score.horizon_s:.2g} s miss speed by {score.rmse('map'):.2g} m/s, one constant factor by "
         f"{score.rmse('factor'):.2g} m/s: {worth}. "
         "The map and K_L cannot be told apart: K_L is 1 by the map's scale."

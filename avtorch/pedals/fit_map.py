@@ -30,6 +30,7 @@ from avtorch.gap.result.free_form import (
     Prior,
     Sizes,
     best_form,
+    beyond,
     fitted,
     knots_of,
     squares_of,
@@ -216,9 +217,12 @@ def car_of(
 
 
 def _knots(drive: PedalDrive) -> tuple[FloatArray, FloatArray]:
-    """Those of the free form; a loop's limits lie where few rows are, so its errors' knots are even in their root."""
+    """Those of the free form, of pedals also at speeds beyond what was driven. A loop's limits lie where few rows are,
+    so its errors' knots are even in their root."""
     u, v = knots_of(drive.command, drive.speed)
-    if drive.is_loop:
+    if not drive.is_loop:
+        v = beyond(v, drive.speed)
+    else:
         low, high = np.sqrt(np.maximum([-u[0], u[-1]], 0.0))
         root = np.linspace(-low, high, _LOOP_KNOTS)
         u = np.sort(np.append((np.sign(root) * root**2)[root**2 > _NEAR_ZERO * drive.command.std()], 0.0))

@@ -103,10 +103,10 @@ class PedalMap:
     """The acceleration demanded: `coasting` (speed,) [m/s²] at the knots `speed` (speed,) [m/s], and what the `pedals`
     add by name; followed with a lag `T_L` [s] after a `dead_time` [s].
 
-    `driven`: lowest and highest speed [m/s] of the drives that taught it, None where nothing is known; beyond them the
-    map goes on along a line. The car's gain K_L is 1 by the map's scale: a car whose gain is halved has half the map.
-    Raises `InputError` for knots that do not rise, tables of another shape, and an acceleration that turns back as a
-    pedal goes on.
+    `driven`: lowest and highest speed [m/s] of the drives that taught it, None where nothing is known; beyond them a
+    map of pedals goes on along a line, and that of a commanded speed is held. The car's gain K_L is 1 by the map's
+    scale: a car whose gain is halved has half the map. Raises `InputError` for knots that do not rise, tables of
+    another shape, and an acceleration that turns back as a pedal goes on.
 
     Example:
         >>> import numpy as np

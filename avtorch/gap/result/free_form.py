@@ -124,7 +124,8 @@ class Car:
     deviations: `steep` [-], and `slope` [-], of their change over a standard deviation of the speed.
 
     Of a closed loop the runs go over whole blocks, begun `before_s` [s] earlier, and errors are whitened: of each, the
-    share `kept` [-] is left in the next."""
+    share `kept` [-] is left in the next. A resistance's line is then no vaguer than its bends: its slope is a feedback
+    of the speed, which the loop has already."""
 
     steep = 0.0
     slope = 0.0
@@ -148,7 +149,8 @@ class Car:
         source, dt = np.concatenate(each), every * data.dt
         starts = np.concatenate([np.arange(len(r)) == 0 for r in each])
         command, speed = _arriving(h, plant_of(h, baseline), source, dt), data.smooth_speed[source]
-        rows = Rows(dt, command, speed, source, starts, *knots_of(command, speed))
+        knots_u, knots_v = knots_of(command, speed)
+        rows = Rows(dt, command, speed, source, starts, knots_u, beyond(knots_v, speed))
 
         def named(log_lag: float) -> FloatArray:
             other = h.copy()
@@ -192,11 +194,15 @@ class Car:
 
 
 def knots_of(command: FloatArray, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where the table is told: knots of commands where they were driven, of speeds also beyond."""
-    driven, spread = _knots(speed, _V_QUANTILES), float(speed.std())
+    """Where the table is told: knots of commands and of speeds, where they were driven."""
+    return _knots(command, _U_QUANTILES, zero=True), _knots(speed, _V_QUANTILES)
+
+
+def beyond(driven: FloatArray, speed: FloatArray) -> FloatArray:
+    """Knots of speeds (knot,) [m/s], those `driven` and some slower and faster ones."""
+    spread = float(speed.std())
     slower = [v for far in reversed(_BEYOND) if (v := driven[0] - far * spread) > 0]
-    faster = [driven[-1] + far * spread for far in _BEYOND]
-    return _knots(command, _U_QUANTILES, zero=True), np.array([*slower, *driven, *faster])
+    return np.array([*slower, *driven, *(driven[-1] + far * spread for far in _BEYOND)])
 
 
 def _arriving(h: Hypothesis, car: GapPlant, source: IntArray, step: float) -> FloatArray:
@@ -255,7 +261,7 @@ class Prior:
         along_v = _matern(z)
         scale = max(float(np.diff(v)[~rows.starts[1:]].std()) / rows.dt, 1e-3)
         table = np.kron(along_u, np.ones_like(along_v)) + 0.5 * np.kron(along_u, along_v)
-        line = LINE_SIZE * scale if sizes.resistance > 0 else 0.0
+        line = scale * (sizes.resistance if rows.loop_s is not None else LINE_SIZE * (sizes.resistance > 0))
         straight = line**2 * (1.0 + np.outer(z, z))
         gains = np.kron(np.outer(rows.knots_u, rows.knots_u), car.steep**2 + car.slope**2 * np.outer(z, z))
         blocks, moves = [], []
