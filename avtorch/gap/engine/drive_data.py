@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
+from numba import njit
 from scipy.fft import dct
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
@@ -240,20 +240,11 @@ class DriveData:
     # rows to coefficients and back -----------------------------------------------------------------------------------
     def transform(self, rows: Sequence[FloatArray]) -> FloatArray:
         """Coefficients (channel, frame, bin) of signals (row,), one a channel."""
-        M, bins = self.frame_rows, self.bin_count
-        h, window = M // 2, self.window
-        out = np.empty((len(rows), len(self.used), bins))
-        for c, x in enumerate(rows):
-            x = np.ascontiguousarray(x)
-            done = 0
-            for first, count in self.frames:
-                stride = x.strides[0]
-                w = np.lib.stride_tricks.as_strided(x[first:], (count, 2 * M), (M * stride, stride)) * window
-                a, b, c_, d = w[:, :h], w[:, h:M], w[:, M : M + h], w[:, M + h :]
-                y = np.concatenate([-c_[:, ::-1] - d, a - b[:, ::-1]], 1)
-                out[c, done : done + count] = _dct4(y)[:, :bins]
-                done += count
-        return out if self.used.all() else out[:, self.used]
+        begins = np.concatenate([first + self.frame_rows * np.arange(count) for first, count in self.frames])[self.used]
+        folded = np.empty((len(rows), len(begins), self.frame_rows))
+        for x, out in zip(rows, folded, strict=True):
+            _fold(np.ascontiguousarray(x), begins, self.window, out)
+        return np.ascontiguousarray(_dct4(folded)[..., : self.bin_count])
 
     def adjoint(self, coefficients: FloatArray) -> FloatArray:
         """Rows (row,) whose inner product with a signal is that of `coefficients` (frame, bin) with its transform."""
@@ -334,11 +325,7 @@ class DriveData:
         """One pole of this time constant [s], at rest at the start of each stretch (see `one_pole`)."""
         if time_constant < 1e-4:
             return x
-        keep, new, old = one_pole(time_constant, self.dt)
-        out = np.empty_like(x)
-        for i, j in zip(self.bounds[:-1], self.bounds[1:], strict=True):
-            out[i:j] = lfilter([new, old], [1, -keep], x[i:j], zi=[(1 - new) * x[i]])[0]
-        return out
+        return _filtered(np.ascontiguousarray(x), self.bounds, *one_pole(time_constant, self.dt))
 
     # inside ----------------------------------------------------------------------------------------------------------
     def _measured(self) -> FloatArray:
@@ -357,9 +344,7 @@ class DriveData:
             at = places()
             below = np.clip(at.astype(np.int64), 0, len(at) - 2)
             self.cache[name] = below, at - below
-        below, share = self.cache[name]
-        out = x[below]
-        return out + share * (x[below + 1] - out)
+        return _read(np.ascontiguousarray(x), *self.cache[name])
 
     def _with_bins(self, edges: IntArray) -> DriveData:
         other = copy.copy(self)
@@ -471,8 +456,42 @@ def _smooth_speed(
 
 
 def _dct4(x: FloatArray) -> FloatArray:
-    """The orthonormal cosine transform of type IV of each row."""
-    return np.asarray(dct(x, type=4, norm="ortho", axis=1))
+    """The orthonormal cosine transform of type IV along the last axis."""
+    return np.asarray(dct(x, type=4, norm="ortho", axis=-1))
+
+
+@njit(cache=True, error_model="numpy")
+def _fold(x: FloatArray, begins: IntArray, window: FloatArray, out: FloatArray) -> None:  # pragma: no cover - compiled
+    """Frames of `x` (row,) that begin at rows `begins` (frame,), windowed and folded to half their length: (frame, M),
+    whose cosine transform is the lapped one."""
+    M = out.shape[1]
+    h = M // 2
+    for f in range(len(begins)):
+        w = x[begins[f] : begins[f] + 2 * M]
+        for k in range(h):
+            out[f, k] = -window[M + h - 1 - k] * w[M + h - 1 - k] - window[M + h + k] * w[M + h + k]
+            out[f, h + k] = window[k] * w[k] - window[M - 1 - k] * w[M - 1 - k]
+
+
+@njit(cache=True, error_model="numpy")
+def _filtered(  # pragma: no cover - compiled
+    x: FloatArray, bounds: IntArray, keep: float, new: float, old: float
+) -> FloatArray:
+    out = np.empty(len(x))
+    for s in range(len(bounds) - 1):
+        out[bounds[s]] = x[bounds[s]]
+        for i in range(bounds[s] + 1, bounds[s + 1]):
+            out[i] = keep * out[i - 1] + new * x[i] + old * x[i - 1]
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _read(x: FloatArray, below: IntArray, share: FloatArray) -> FloatArray:  # pragma: no cover - compiled
+    out = np.empty(len(below))
+    for i in range(len(below)):
+        k = below[i]
+        out[i] = x[k] + share[i] * (x[k + 1] - x[k])
+    return out
 
 
 def _even(rows: int) -> int:
