@@ -30,7 +30,8 @@ def test_the_ucar_is_read_by_its_throttle(data_dir: Path) -> None:
 def test_the_map_of_the_ucar_is_its_published_model(data_dir: Path) -> None:
     """dv/dt = (6.54 throttle^1.5926 - v) / 0.70 s after 0.031 s."""
     made = fit_pedals(Log.read(data_dir / UCAR)).map
-    speed = np.linspace(made.speed[0], made.speed[-1], 400)
+    assert made.driven is not None
+    speed = np.linspace(*made.driven, 400)
     for throttle in (0.25, 0.3, 0.4):  # at 0.5 it would go 2.2 m/s, where the log hardly is
         accel = made.accel(speed, throttle=np.full(400, throttle))
         assert np.interp(0.0, -accel, speed) == pytest.approx(6.54 * throttle**1.5926, rel=0.1)
