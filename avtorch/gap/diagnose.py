@@ -54,6 +54,7 @@ from avtorch.io import LogSource, as_logs
 from avtorch.io.mapping import Pairs
 
 _FORMS = {
+    (False, False): "a gain that free runs teach",
     (True, False): "a force map of command and speed",
     (False, True): "a resistance that depends on the speed",
     (True, True): "a force map of command and speed and a resistance that depends on the speed",
@@ -161,12 +162,12 @@ def diagnose(
     if told is not None:
         told("held-out blocks", 0, 1)
     found = None if named_only else fitted_form(repaired.examined.hypothesis, base, none)
-    free = found if found is not None and found.earns_its_place else None
+    free = found if found is not None and found.earns_its_place(named=named) else None
     held = None
     if Blocks.of(inference.data) is not None:
         visited = [h for h in inference.search.visited.values() if h.force is None]
         held = held_out_errors(nested(none, repaired.examined.hypothesis, visited), free)
-        if held is not None and free is not None and not held.free_gains:
+        if held is not None and free is not None and not held.free_gains(named=named):
             free, held = None, held.without_free()
     lag_and_gain, assumed = base_quantities(none, seed)
     bare = _base_weight(inference)

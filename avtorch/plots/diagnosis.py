@@ -387,7 +387,7 @@ def free_form_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     Raises `InputError` where it carries nothing.
     """
     form = found.free_form
-    if form is None:
+    if form is None or not form.sizes.any:
         raise InputError("free_form: the repaired simulator carries nothing without a name")
     panels = [
         draw

@@ -191,7 +191,7 @@ def _budget(found: Diagnosis) -> Picture | None:
 
 def _free_form(found: Diagnosis) -> Picture | None:
     form = found.free_form
-    if form is None:
+    if form is None or not form.sizes.any:
         return None
     u, v = form.knots_u, form.knots_v
     columns, rows, says = ["speed [m/s]"], v[:, None], []

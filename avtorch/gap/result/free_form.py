@@ -79,7 +79,9 @@ class Sizes:
 
     @property
     def nats(self) -> float:
-        """What they cost: presence, and the log-normal prior of sizes."""
+        """What they cost: presence, and the log-normal prior of sizes; a gain alone, its presence."""
+        if not self.any:
+            return FORM_NATS
         middle, spread = MAP_SIZE
         on = [z for z in (self.resistance, self.table) if z > 0]
         alone = NO_RESISTANCE_NATS if self.table > 0 and not self.resistance > 0 else 0.0
@@ -437,22 +439,25 @@ class Products:
 
 @dataclass(frozen=True, eq=False)
 class FittedForm:
-    """A free form beside a hypothesis. On blocks left out, as logarithms of the mean squared error over that of the
-    baseline, whose gain the same blocks teach, each by the worse way of leaving out: `score`, with what the form costs,
-    and `named`, of the hypothesis by itself."""
+    """A free form beside a hypothesis; without a table and a resistance it is the gain of free runs.
+
+    On blocks left out, as logarithms of the mean squared error over that of the baseline, whose gain the same blocks
+    teach, each by the worse way of leaving out: `score`, with what the form costs, `named`, of the hypothesis by
+    itself, and `bare`, of the baseline with the evidence's gain.
+    """
 
     hypothesis: Hypothesis
     form: FreeForm
     score: float
     named: float
+    bare: float
     car: Car = field(repr=False)
     x: FloatArray = field(repr=False)
     independent: float
 
-    @property
-    def earns_its_place(self) -> bool:
-        """Whether it foretells blocks left out better than names alone, and than the baseline."""
-        return self.form.sizes.any and self.score < min(self.named, 0.0)
+    def earns_its_place(self, *, named: bool) -> bool:
+        """Whether it foretells blocks left out better than what is handed back without it: names, or the baseline."""
+        return self.score < (self.named if named else self.bare)
 
     def without(self, without: Sequence[slice]) -> FloatArray:
         """Acceleration [m/s²] on the grid that it adds to the hypothesis at `lagged`, taught by the other rows."""
@@ -500,13 +505,16 @@ def fitted_form(h: Hypothesis, baseline: GapPlant | None, bare: Hypothesis) -> F
     independent = max(len(car.rows.speed) * car.rows.dt / INDEPENDENT_S, 3.0)
     base = Car.of(bare, baseline, (float(np.log(bare["T_L"])), 1.0))
     over = squares_of(Fit(base, base.zero, cut=True), Prior(base, Sizes(0.0, 0.0)), left, independent)
-    errors = drive(car, car.zero, cut=True)[0]
-    named = np.array([_sum_told(errors, runs, told) for told in left.told])
+
+    def as_it_is(car: Car) -> float:
+        errors = drive(car, car.zero, cut=True)[0]
+        return left.worse(np.array([_sum_told(errors, runs, told) for told in left.told]), over)
+
     best = best_form(car, left, over, independent)
     x, sizes = best.fit.x, best.sizes
     at = Coefficients.of(x[:-1], car.rows.shape)
     form = FreeForm(car.rows.knots_u, car.rows.knots_v, at, sizes, float(np.exp(x[-1])))
-    return FittedForm(h, form, best.score, left.worse(named, over), car, x, independent)
+    return FittedForm(h, form, best.score, as_it_is(car), as_it_is(base), car, x, independent)
 
 
 def _as_a_plant(h: Hypothesis) -> Hypothesis:

@@ -6,6 +6,7 @@ from functools import cache
 from typing import Any, cast
 
 import numpy as np
+from scipy.signal import lfilter
 import pytest
 
 from avtorch.gap import ConstantResistance, ForceTable, GapPlant, Gust, ResistanceCurve, plant
@@ -15,6 +16,7 @@ from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.result.free_form import FittedForm, Sizes, fitted_form
 from avtorch.gap.result.held_out import HeldOut, Scores
 from avtorch.gap.result.output_error import Coefficients, Rows, Runs
+from avtorch.io import Log
 from tests.gap.cars import log_of
 
 MAP = ForceTable((-2.0, 0.0, 2.0), (5.0, 30.0), ((1.0, 0.6), (0.0, 0.0), (-0.2, -1.2)))
@@ -32,7 +34,7 @@ def found(mapped: bool, seconds: float = 120.0) -> FittedForm:
 
 def test_a_car_with_a_map_is_foretold_better_with_one() -> None:
     form = found(True)
-    assert form.earns_its_place
+    assert form.earns_its_place(named=False)
     assert form.score < -1.0
     car = form.form.beside(plant([], T_L=0.3))
     assert GapPlant.from_toml(car.to_toml()).to_toml() == car.to_toml()
@@ -41,7 +43,7 @@ def test_a_car_with_a_map_is_foretold_better_with_one() -> None:
 
 def test_a_car_without_one_comes_back_without_it() -> None:
     form = found(False)
-    assert not form.earns_its_place or form.score > -0.5
+    assert not form.earns_its_place(named=False) or form.score > -0.5
 
 
 def test_what_a_block_tells_does_not_teach_it() -> None:
@@ -82,7 +84,7 @@ def test_a_free_form_that_loses_in_the_budgets_runs_is_not_handed_back(named: fl
     scale = np.array([[4.0, 4.0], [0.01, 0.03]])  # (channel, block)
     steps = tuple(Scores(x * scale, np.zeros(2)) for x in (1.0, named, free))
     held = HeldOut((), cast(Any, None), steps, steps[0], steps[1], steps[0], np.zeros(1), horizon_s=10.0, free=True)
-    assert held.free_gains == gains
+    assert held.free_gains(named=True) == gains
     assert [x.squares[0, 0] for x in held.without_free().steps] == [4.0, 4.0 * named]
     assert not held.without_free().free
 
@@ -91,3 +93,24 @@ def test_the_gust_beside_a_free_form_is_not_handed_back() -> None:
     """The form takes a part of it; what is left is not known."""
     back = found(mapped=True).form.beside(plant([Gust(0.3, 5.0), ConstantResistance(0.1)]))
     assert [e.name for e in back.effects if e.name in ("gust", "constant_resistance")] == ["constant_resistance"]
+
+
+def test_a_gain_of_free_runs_is_handed_back_where_the_evidences_errs() -> None:
+    """Only slow commands move this car; the evidence, which looks at all of them, finds a third of its gain or less."""
+    rng = np.random.default_rng(3)
+    time = 0.05 * np.arange(2400)
+    slow = np.sin(0.3 * time) + 0.7 * np.sin(0.11 * time)
+    lost = np.repeat(rng.normal(0.0, 1.5, 1200), 2)  # of a motor that does not follow them
+    accel = lfilter([0.1], [1, -0.9], slow)
+    speed = 20 + 0.05 * np.cumsum(accel) + 0.01 * rng.normal(size=len(time))
+    log = Log.from_arrays(
+        time=time, accel_cmd=slow + lost, accel=accel + 0.05 * rng.normal(size=len(time)), speed=speed
+    )
+    base = fit(base_fit(DriveData.of(log)))
+    form = fitted_form(base, plant([]), base)
+    assert form is not None
+    assert base["K_L"] < 0.5
+    assert form.earns_its_place(named=False)
+    back = form.form.beside(plant([], T_L=base["T_L"], K_L=base["K_L"]))
+    assert float(back.K_L) == pytest.approx(1.0, abs=0.1)
+    assert not back.effects
