@@ -6,8 +6,8 @@ from functools import cache
 from typing import Any, cast
 
 import numpy as np
-from scipy.signal import lfilter
 import pytest
+from scipy.signal import lfilter
 
 from avtorch.gap import ConstantResistance, ForceTable, GapPlant, Gust, ResistanceCurve, plant
 from avtorch.gap.engine.drive_data import DriveData
