@@ -59,7 +59,7 @@ _FORMS = {
     (False, True): "a resistance that depends on the speed",
     (True, True): "a force map of command and speed and a resistance that depends on the speed",
 }
-_CARRIES = "Beside its names the repaired simulator carries {}, without a name: on blocks left out it foretells more."
+_CARRIES = "repaired simulator carries {}, without a name: on blocks left out it foretells more."
 
 
 @shows_progress
@@ -216,7 +216,8 @@ def diagnose(
     )
     if free is not None:
         sizes = free.form.sizes
-        notes[_CARRIES.format(_FORMS[sizes.table > 0, sizes.resistance > 0])] = None
+        carries = _CARRIES.format(_FORMS[sizes.table > 0, sizes.resistance > 0])
+        notes[f"{'Beside its names the' if named else 'The'} {carries}"] = None
     if told is not None:
         told("held-out blocks", 1, 1)
     hidden = not_observable(data.channels, kinds)

@@ -42,7 +42,7 @@ class Trial:
         >>> _ = diagnose(log, effects=["sensor_bias"], pairs=False).write("out")
         >>> trial = Trial.of(log, "out")
         >>> _, errors = trial.rollout(trial.car, ["sensor_bias"], {"sensor_bias.bias_mps2": 0.1})
-        >>> round(errors["accel"], 2)  # of 0.3 m/s² two thirds are missing again
+        >>> round(errors["accel"], 1)  # of 0.3 m/s² two thirds are missing again
         0.2
     """
 

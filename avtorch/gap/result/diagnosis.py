@@ -48,7 +48,7 @@ class Diagnosis(Displayed, Findings):
 
     - `candidates`: the hypotheses as `listed_candidates` orders them, whatever the order given
     - `simulator`: the user's own, with `T_L` and `K_L` fitted without any effect; `plant`: the same with the verdict's
-      effects, at the posterior mean, and a `free_form` where that foretells more; None where there is neither
+      effects, at the posterior mode, and a `free_form` where that foretells more; None where there is neither
     - `assumed`: draws (draw,) of the simulator's `T_L` [s] and `K_L`; `belief`: draws (draw,) of the parameters of
       `plant`, or of `simulator` where there is none, by its own names; `draws`: posterior of the winner's parameters
       (chain, draw) by the table's names

@@ -171,21 +171,26 @@ def shrinkage(found: Findings) -> list[str]:
         return []
     top = scores.top
     parts = "drives" if scores.by_drives else "blocks"
-    effect, it, closes = ("effects", "them", "close") if len(found.verdict.names) > 1 else ("effect", "it", "closes")
+    many = len(found.verdict.names) > 1
+    what, closes = ("the effects", "close") if many else ("the effect", "closes")
+    before, after = f"without {what}", "with them" if many else "with it"
+    if found.free_form is not None:
+        what, closes, before, after = "that", "closes", "of the baseline", "of the repaired simulator"
     if scores.metric in _MEASURES:
         words, unit = _MEASURES[scores.metric]
         over = _over(top.horizon_s)
-        errors = f"{words} error {top.before:.2g} {unit} without the {effect}, {top.after:.2g} {unit} with {it}"
-        line = f"On held-out {parts}{over}: {errors}"
+        line = (
+            f"On held-out {parts}{over}: {words} error {top.before:.2g} {unit} {before}, {top.after:.2g} {unit} {after}"
+        )
     else:
-        gain = top.after - top.before
-        density = f"log predictive density {gain:+.2g} nats per row with the {effect}"
-        line = f"On held-out {parts}: {density}; rollouts do not show it"
+        density = f"log predictive density {top.after - top.before:+.2g} nats per row"
+        by = f"with {what}" if found.free_form is None else after
+        line = f"On held-out {parts}: {density} {by}; rollouts do not show it"
     if top.closed is None:
         return [f"{line}; almost none of the gap is reducible."]
     q = top.closed
     share = f"{100 * q.mean:.0f} % ({100 * q.q05:.0f} to {100 * q.q95:.0f})"
-    return [f"{line}; the {effect} {closes} {share} of the reducible gap."]
+    return [f"{line}; {what} {closes} {share} of the reducible gap."]
 
 
 def moved(found: Findings) -> list[str]:
