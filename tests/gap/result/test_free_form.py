@@ -95,9 +95,9 @@ def test_the_gust_beside_a_free_form_is_not_handed_back() -> None:
     assert [e.name for e in back.effects if e.name in ("gust", "constant_resistance")] == ["constant_resistance"]
 
 
-def test_a_gain_of_free_runs_is_handed_back_where_the_evidences_errs() -> None:
+def test_a_gain_of_free_runs_is_handed_back_where_the_evidences_errs(fresh_seed: int) -> None:
     """Only slow commands move this car; the evidence, which looks at all of them, finds a third of its gain or less."""
-    rng = np.random.default_rng(3)
+    rng = np.random.default_rng(fresh_seed)
     time = 0.05 * np.arange(2400)
     slow = np.sin(0.3 * time) + 0.7 * np.sin(0.11 * time)
     lost = np.repeat(rng.normal(0.0, 1.5, 1200), 2)  # of a motor that does not follow them
@@ -112,5 +112,6 @@ def test_a_gain_of_free_runs_is_handed_back_where_the_evidences_errs() -> None:
     assert base["K_L"] < 0.5
     assert form.earns_its_place(named=False)
     back = form.form.beside(plant([], T_L=base["T_L"], K_L=base["K_L"]))
-    assert float(back.K_L) == pytest.approx(1.0, abs=0.1)
+    # what it does not follow is noise of the command, and makes a regression's gain a little small
+    assert abs(float(back.K_L) - 1.0) < 0.25 * abs(base["K_L"] - 1.0)
     assert not back.effects
