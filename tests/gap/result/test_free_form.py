@@ -114,4 +114,3 @@ def test_a_gain_of_free_runs_is_handed_back_where_the_evidences_errs(fresh_seed:
     back = form.form.beside(plant([], T_L=base["T_L"], K_L=base["K_L"]))
     # what it does not follow is noise of the command, and makes a regression's gain a little small
     assert abs(float(back.K_L) - 1.0) < 0.25 * abs(base["K_L"] - 1.0)
-    assert not back.effects
