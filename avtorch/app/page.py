@@ -81,7 +81,7 @@ class View:
         self.unit: dict[str, str] = {}
         self.drop_downs: dict[tuple[str, str], pn.widgets.Select] = {}
         self.job: Job | None = None
-        self._setting = False  # the drop-downs, which is no choice of the user's
+        self.shown: dict[tuple[str, str], str] = {}  # in the drop-downs; what differs is a choice of the user's
         what = "Diagnose" if len(paths) == 1 else "Compare"
         self.seen, self.status, self.columns = _html('<p role="status">Reading</p>'), _html(), pn.FlexBox(**_WIDE)
         self.chart, self.result = pn.Column(**_WIDE), pn.Column(**_WIDE)
@@ -122,16 +122,17 @@ class View:
         path, signals = self.paths[0], dict(found.proposal.signals) if found.proposal is not None else {}
         names = list(open_recording(path).names if is_recording(path) else read_table(path).names)
         stated = read_mapping(path, map=self.map, unit=self.unit)
-        self._setting = True
-        for signal in dict.fromkeys(["time", "accel_cmd", "accel", "speed", *signals, *stated.column]):
+        order = list(dict.fromkeys(["time", "accel_cmd", "accel", "speed", *signals, *stated.column]))
+        for signal in order:
             one = signals.get(signal)
             column = one.column if one else stated.column.get(signal, signal if found.proposal is None else _NONE)
             self._drop_down("map", signal, names, column if column in names else _NONE)
-            if signal in _UNITS:
+            if signal in _UNITS and column in names:
                 unit = (one.unit if one else stated.unit.get(signal)) or _UNITS[signal][0]
                 self._drop_down("unit", signal, _UNITS[signal], unit)
-        self._setting = False
-        self.columns[:] = list(self.drop_downs.values())
+        self.columns[:] = [
+            box for signal in order for kind in ("map", "unit") if (box := self.drop_downs.get((kind, signal)))
+        ]
         self.chart[:] = []
         if (log := found.log) is not None:
             lines = {"acceleration [m/s²]": {"command": log.accel_cmd, "measured": log.accel}}
@@ -147,11 +148,12 @@ class View:
             box = pn.widgets.Select(name=title, width=150 if kind == "map" else 90, stylesheets=STYLES)
             box.param.watch(partial(self._changed, kind, signal), "value")
             self.drop_downs[kind, signal] = box
+        self.shown[kind, signal] = value
         box.param.update(options=list(dict.fromkeys([value, *options])), value=value)
 
     async def _changed(self, kind: str, signal: str, event: Any) -> None:
-        if not self._setting and event.new != _NONE:
-            getattr(self, kind)[signal] = event.new
+        if event.new not in (_NONE, self.shown[kind, signal]):
+            getattr(self, kind)[signal] = self.shown[kind, signal] = event.new
             await self._load()
 
     # the run ---------------------------------------------------------------------------------------------------------

@@ -75,9 +75,8 @@ def _bars_of(budget: Budget) -> list[tuple[str, Quantity, str]]:
         rest = budget.unexplained
         carried = [] if rest.carried is None else [("a force without a name", rest.carried, SKY)]
         return [*named, *carried, ("unexplained", rest.beyond_carried, ORANGE)]
-    rest = budget.left_above_noise
-    both = (("unexplained", rest, ORANGE if budget.unexplained.material else SKY), ("noise", 1.0 - rest, GREY))
-    return [(name, Quantity(share, 0.0, share, share), colour) for name, share, colour in both]
+    rest, noise = budget.error
+    return [("unexplained", rest, ORANGE if budget.unexplained.material else SKY), ("noise", noise, GREY)]
 
 
 _UP_TO_ONE = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)

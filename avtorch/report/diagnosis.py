@@ -160,7 +160,7 @@ def _budget(found: Diagnosis) -> Picture | None:
     budget = found.budget
     if budget is None:
         return None
-    rest, over = budget.left_above_noise, f"the squared error of {budget.horizon_s:.3g} s simulations"
+    (rest, noise), over = budget.error, f"the squared error of {budget.horizon_s:.3g} s simulations"
     if budget.parts:
         rest_of = budget.unexplained
         shares = [(part.name, part.share) for part in budget.parts]
@@ -176,12 +176,14 @@ def _budget(found: Diagnosis) -> Picture | None:
     else:
         says = (
             "Bars of what the error of the baseline simulator consists of: "
-            f"unexplained {share_of(rest)}, noise {share_of(1.0 - rest)}."
+            f"unexplained {share_of(rest.mean)}, noise {share_of(noise.mean)}."
         )
-        counts = "What is unexplained does not count: it is too little, or not sure." if rest else "All of it is noise."
+        counts = "What is unexplained does not count: it is too little, or not sure." if rest.mean else ""
+        counts = f"{counts} The error is {budget.unexplained.rest(budget.material)}.".strip()
         caption = (
             f"Shares of {over} by the baseline, on parts of the drive not used for fitting. Noise is what commands, "
-            "speed and place do not predict; what is unexplained is reproducible, and no known effect reduces it."
+            "speed and place do not predict; what is unexplained is reproducible, and no known effect reduces it. "
+            "Black lines: 90 % intervals."
             f"{'' if budget.unexplained.material else f' {counts}'}"
         )
     table = budget_table(budget, found.log.epochs_s[0])

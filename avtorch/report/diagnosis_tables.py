@@ -27,14 +27,16 @@ _FAINT = 0.01  # hypotheses less probable than this are only counted
 def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
     """What each cause contributes to the gap, or without any what the error consists of; times count from `epoch_s`."""
     share = "share of the gap (90 %)" if budget.parts else "share of the error"
-    columns = ("effect", share, "probability", "parameters (90 %)", "cannot be told from")
+    several = any(len(part.alias_set) > 1 for part in (*budget.parts, *budget.chance))
+    chance = "probability of it or an alias" if several else "probability"
+    columns = ("effect", share, chance, "parameters (90 %)", "aliases, not told apart")
     named = [(part, percent(part.share)) for part in budget.parts]
     rows = []
     for part, share in [*named, *((part, "by chance, part of the noise") for part in budget.chance)]:
         parameters = _parameters(part.parameters or {}) + ([] if part.plausible else [_IMPLAUSIBLE])
         alike = ", ".join(name for name in part.alias_set if name != part.name)
         rows.append((part.name, share, sentences.number(part.probability), "; ".join(parameters), alike))
-    places, rest = budget.unexplained.places(epoch_s), budget.left_above_noise
+    places, (rest, noise) = budget.unexplained.places(epoch_s), budget.error
     if budget.parts:
         carried = budget.unexplained.carried
         if carried is not None:
@@ -42,10 +44,10 @@ def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
         rows.append(("unexplained", percent(budget.unexplained.beyond_carried), "", places, ""))
     else:
         rows += [
-            ("unexplained", budget_parts.percent(rest), "", places, ""),
-            ("noise", budget_parts.percent(1.0 - rest), "", "", ""),
+            ("unexplained", percent(rest), "", places, ""),
+            ("noise", percent(noise), "", "", ""),
         ]
-    return Table("The gap's budget", columns, tuple(rows), numeric=("probability",))
+    return Table("The gap's budget", columns, tuple(rows), numeric=(chance,))
 
 
 def family_table(budget: Budget) -> Table | None:

@@ -36,6 +36,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("logs")
     drive(place / "before.csv", 0.1)
     drive(place / "after.csv", 0.5)
+    rows = [line.split(";") for line in (place / "before.csv").read_text().splitlines()]
+    (place / "speed_alone.csv").write_text("\n".join(f"{row[0]};{row[1]};{row[3]}" for row in rows))
     (place / "broken.csv").write_bytes(b"\x00\x01 no table")
     (place / "<b>odd & name.csv").write_text("time,speed\n0,1\n")
     return place
@@ -133,6 +135,18 @@ def test_what_is_shown_can_be_kept_and_repeated(browser: Any, address: str, diag
     assert Path(saved.value.path()).read_bytes() == (folder / diagnosed / "plant.toml").read_bytes()
     line = page.locator("pre").first.text_content()
     assert line == f"cd {folder} && avtorch diagnose out/logs/mine.csv --credibility --out out/mine"
+    page.close()
+
+
+def test_a_log_of_command_and_speed_alone_can_be_diagnosed(browser: Any, address: str) -> None:
+    expect = pytest.importorskip("playwright.sync_api").expect
+    page = opened(browser, f"{address}?log=speed_alone.csv")
+    page.get_by_label("speed in", exact=True).wait_for()
+    page.locator("canvas").first.wait_for()
+    page.wait_for_timeout(1_000)  # an answer to the drop-downs' own setting would be there
+    expect(page.get_by_role("button", name="Diagnose")).to_be_enabled()
+    assert page.get_by_role("alert").count() == 0
+    assert page.get_by_label("accel in", exact=True).count() == 0
     page.close()
 
 

@@ -21,11 +21,11 @@ def named(found: Diagnosis) -> Diagnosis:
     return found
 
 
-def unnamed(found: Diagnosis, name: str, before: float) -> Diagnosis:
-    """An answer without any part, whose error is `before` times the floor."""
+def unnamed(found: Diagnosis, name: str, before: float, still: Quantity | None = None) -> Diagnosis:
+    """An answer without any part, whose error is `before` times the floor; a black box may take off `still`."""
     budget = named(found).budget
     assert budget is not None
-    rest = replace(budget.unexplained, share=WHOLE, material=name == "unknown")
+    rest = replace(budget.unexplained, share=WHOLE, material=name == "unknown", still=still)
     verdict = replace(
         found.verdict, names=(name,), alias_set=(name,), abstained=name == "unknown", why="Nothing known."
     )
@@ -72,4 +72,10 @@ def test_its_caption_says_whether_what_is_left_counts(found: Diagnosis) -> None:
         captions[name] = picture(answer).caption
     assert "does not count" not in captions["unknown"]
     assert "does not count" in captions["none"]
-    assert "All of it is noise" in captions["nothing"]
+    assert "The error is noise." in captions["nothing"]
+
+
+def test_a_log_that_cannot_tell_noise_says_so(found: Diagnosis) -> None:
+    first = picture(unnamed(found, "none", 1.0, Quantity(0.0, 0.1, 0.0, 1.0)))
+    assert "this log is too short to tell" in first.caption
+    assert [row[1] for row in first.tables[0].rows] == ["0 % (0 to 100)", "100 % (0 to 100)"]

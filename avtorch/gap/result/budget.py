@@ -227,6 +227,13 @@ class Budget:
         return max(1.0 - (self.floor / self.left) ** 2, 0.0)
 
     @property
+    def error(self) -> tuple[Quantity, Quantity]:
+        """Shares of the squared error that is left: reproducible, and noise; as far as a black box tells them apart."""
+        mean, still = self.left_above_noise, self.unexplained.still
+        low, high = (mean, mean) if still is None else (min(still.q05, mean), max(still.q95, mean))
+        return Quantity(mean, 0.0, low, high), Quantity(1 - mean, 0.0, 1 - high, 1 - low)
+
+    @property
     def verdict(self) -> tuple[str, ...]:
         """`names`; without any `("unknown",)` where something material is reproducible, else `("none",)`."""
         return self.names or (("unknown",) if self.unexplained.material else ("none",))
@@ -284,7 +291,7 @@ class Budget:
                 lines.append(f"{percent(rest)} is reproducible and no known effect explains it")
         by_chance = [_words(c) for c in self.chance if c.probability >= LIKELY]
         noise = self.unexplained.rest(self.material)
-        noise = noise if not by_chance else f"{noise}, in part this: {' and '.join(by_chance)}"
+        noise = noise if not by_chance else f"in part this: {' and '.join(by_chance)}; else {noise}"
         lines.append(f"the rest of the error is {noise}")
         text = "; ".join(lines) + "."
         return text[0].upper() + text[1:]

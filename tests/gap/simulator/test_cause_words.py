@@ -104,5 +104,5 @@ def test_a_budget_says_them_with_their_names_behind() -> None:
         "physically implausible as fitted); "
         "commands of less than 0.12 m/s² do nothing (dead_band) with under 3 %; "
         "4 % is reproducible and no known effect explains it; "
-        "the rest of the error is noise, in part this: wind and road push the car at random by 0.27 m/s² (gust)."
+        "the rest of the error is in part this: wind and road push the car at random by 0.27 m/s² (gust); else noise."
     )
