@@ -16,7 +16,13 @@ S_b n_b is Wishart distributed (Anderson 2003, ch. 7). For a given P_b the senso
 root of a cubic (`wishart_profile`), so a grid over sizes and times costs a few milliseconds. Process noise is always
 there: a gust or a road counts by what it gains over it.
 
-With one channel nothing is common: what exceeds the noise of a smooth sensor is the force.
+With one channel nothing is common: what exceeds the noise of a smooth sensor is the force. An accelerometer fixed to
+the car (`accel_kind` "specific-force") does not feel gravity: there a road is in the speed alone, and is what exceeds
+the noise of a smooth sensor in it,
+
+    V_b = P_b 1 1' + diag(a_b, R_b + c f_b²),
+
+R_b the road's power, c that of the speed's white noise.
 """
 
 from __future__ import annotations
@@ -300,11 +306,13 @@ def slow_forces(
     sensor = _before_the_sensor(data, values, bands)
     covariance, counts = np.ascontiguousarray(covariance[:bands] * sensor), np.asarray(counts[:bands], float)
 
-    def nats(power: FloatArray) -> FloatArray:
-        """(...,) of powers (..., band)."""
-        if data.channel_count == 2:
-            return wishart_profile(covariance, counts, power)[0].sum(-1)
-        return _one_channel(data, covariance[:, 0, 0], counts, power).sum(-1)
+    def nats(force: FloatArray, road: FloatArray | float = 0.0) -> FloatArray:
+        """(...,) of powers (..., band) of a force and of a road."""
+        if data.channel_count == 1:
+            return _one_channel(data, covariance[:, 0, 0], counts, force + road).sum(-1)
+        if data.accel_kind == "specific-force":
+            return _road_in_the_speed(data, covariance, counts, force, road).sum(-1)
+        return wishart_profile(covariance, counts, force + road)[0].sum(-1)
 
     lags = np.atleast_1d(values[INDEX["T_L"]] if lags is None else lags)
     spectra = process_spectrum(frequency, lags)
@@ -321,10 +329,12 @@ def slow_forces(
     sizes = size / _GRID_RATIO ** np.array(PROCESS_NOISE_STEPS)
     process, prior = sizes[:, None] ** 2 * unit[lag], _log_normal(sizes, PROCESS_NOISE)
 
-    def best(unit: FloatArray, sizes: tuple[float, float], shape_prior: FloatArray) -> tuple[float, tuple[int, ...]]:
+    def best(
+        unit: FloatArray, sizes: tuple[float, float], shape_prior: FloatArray, *, road: bool = False
+    ) -> tuple[float, tuple[int, ...]]:
         """Most nats over process noise alone, and where: of process noise, of the size, of the spectrum's shape."""
-        slow = SIZE_GRID_MPS2[:, None, None] ** 2 * unit
-        total = nats(process[:, None, None] + slow) + prior[:, None, None]
+        slow, fast = SIZE_GRID_MPS2[:, None, None] ** 2 * unit, process[:, None, None]
+        total = (nats(fast, slow) if road else nats(fast + slow)) + prior[:, None, None]
         total += _log_normal(SIZE_GRID_MPS2, sizes)[:, None] + shape_prior
         at = np.unravel_index(np.argmax(total), total.shape)
         return float(total[at]) - base, tuple(int(i) for i in at)
@@ -332,7 +342,7 @@ def slow_forces(
     gusts = gust_spectrum(frequency, GUST_TIME_GRID_S) @ energy.T
     gust, (g0, g1, g2) = best(gusts, GUST_SD_MPS2, _log_normal(GUST_TIME_GRID_S, GUST_TIME_S))
     roads = road_spectrum(frequency, _mean_speed(data) / ROAD_LENGTH_GRID_M) @ energy.T
-    road, (r0, r1, r2) = best(roads, ROAD_SD_MPS2, _log_normal(ROAD_LENGTH_GRID_M, ROAD_LENGTH_M))
+    road, (r0, r1, r2) = best(roads, ROAD_SD_MPS2, _log_normal(ROAD_LENGTH_GRID_M, ROAD_LENGTH_M), road=True)
     return SlowForces(
         log_likelihood=base,
         bands=bands,
@@ -368,11 +378,12 @@ def slow_onset(
 ) -> SlowOnset:
     """When a gust or a road sets in, if it does: between `ONSET_SHARES` of the frames, in drives of ten frames or more.
 
-    Process noise alone explains what was before, the same with the force what comes after; `found` of the whole drive
-    tells only the sensors, for over both parts a gust of half the time passes for process noise, or this for a gust.
+    Not asked of a road that an accelerometer does not feel. Process noise alone explains what was before, the same with
+    the force what comes after; `found` of the whole drive tells only the sensors, for over both parts a gust of half
+    the time passes for process noise, or this for a gust.
     """
     frames = data.frame_count
-    if frames < 10:
+    if frames < 10 or (kind == "road" and data.accel_kind == "specific-force"):
         return SlowOnset(0.0)
     frequency, energy = band_response(data)
     unit = found.process_power / found.process_noise_beside_gust**2
@@ -474,13 +485,32 @@ def _log_normal(x: FloatArray, prior: tuple[float, float]) -> FloatArray:
 
 
 def _one_channel(data: DriveData, variance: FloatArray, counts: FloatArray, power: FloatArray) -> FloatArray:
-    """Nats (..., band) of a `power` (..., band) in one channel, beside the most noise that its sensor can have.
+    """Nats (..., band) of a `power` (..., band) in one channel, beside the most noise that its sensor can have."""
+    total = np.maximum(power, _POWER_FLOOR) + _smooth_sensor(data, variance)
+    return -0.5 * counts * (np.log(total) + variance / total)
+
+
+def _road_in_the_speed(
+    data: DriveData, covariance: FloatArray, counts: FloatArray, force: FloatArray, road: FloatArray | float
+) -> FloatArray:
+    """Nats (..., band) of a `force` on both channels and a `road` in the speed alone, at the best variance a of the
+    accelerometer: given the speed's coefficient y, the accelerometer's is N(g y, v) with g = P / (P + R + c)."""
+    s00, s01, s11 = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    own = _smooth_sensor(data, np.maximum(s11 - s01, _SENSOR_FLOOR * s11))  # what the speed shares with nothing
+    force = np.maximum(force, _POWER_FLOOR)
+    total = force + road + own
+    g = force / total
+    left = s00 - 2 * g * s01 + g * g * s11
+    v = np.maximum(left, force - g * force + _SENSOR_FLOOR * s00)
+    return -0.5 * counts * (np.log(total) + s11 / total + np.log(v) + left / v)
+
+
+def _smooth_sensor(data: DriveData, variance: FloatArray) -> FloatArray:
+    """The most noise (band,) that a sensor of these variances (band,) can have.
 
     White noise of a speed rises with f² in its difference, that of an acceleration is flat.
     """
     f = data.frequency[data.band_edges[: len(variance)]]
     shape = f**2 if data.speed is not None else np.ones_like(f)
     fast = f > SENSOR_ALONE_HZ
-    sensor = (variance[fast] / shape[fast]).min() * shape if fast.any() else 0.0 * shape
-    total = np.maximum(power, _POWER_FLOOR) + sensor
-    return -0.5 * counts * (np.log(total) + variance / total)
+    return (variance[fast] / shape[fast]).min() * shape if fast.any() else 0.0 * shape
