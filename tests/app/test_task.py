@@ -33,6 +33,7 @@ def run(task: Task, folder: Path, slots: int = 1) -> Job:
     return Job(task, folder, threading.Semaphore(slots))
 
 
+@pytest.mark.slow
 def test_a_broken_file_fails_with_the_words_of_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "drive.csv").write_text(FAULTY)
     job = run(Task(["drive.csv"], "out/drive"), tmp_path)

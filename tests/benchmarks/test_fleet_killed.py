@@ -34,6 +34,7 @@ def test_whole_rows_have_no_fault(monkeypatch: pytest.MonkeyPatch, paths: list[P
     assert found(monkeypatch, paths, rows_of(paths)) == []
 
 
+@pytest.mark.slow
 def test_a_lost_a_doubled_and_a_changed_row_are_told(monkeypatch: pytest.MonkeyPatch, paths: list[Path]) -> None:
     one, other = rows_of(paths)
     assert any("no rows of check" in line for line in found(monkeypatch, paths, [one]))

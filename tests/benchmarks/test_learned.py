@@ -12,6 +12,7 @@ from benchmarks.learned.prediction import DT, DelayedGLVD, OneStep, Recurrent, e
 F64 = torch.float64
 
 
+@pytest.mark.slow
 def test_glvd_foretells_a_car_that_is_glvd_and_finds_it() -> None:
     drive = [simulated(GLVDPlant(0.5, 0.8, sigma=0.0), 40.0, 40.0, 0)]
     truth = DelayedGLVD(0.5, 0.8, 0.0, 0.0)

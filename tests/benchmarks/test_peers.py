@@ -102,6 +102,7 @@ def test_missing_peer_is_a_line_with_its_pip_command(
     assert capsys.readouterr().out.count("not installed: pip install absent") == 2
 
 
+@pytest.mark.slow
 def test_failing_method_is_a_line_not_the_end(capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
     # its process does not find this name in the registry
     broken = Method("broken", "Broken sampler", "laplace", fixed=True)

@@ -23,6 +23,7 @@ EFFECTS = {
 }
 
 
+@pytest.mark.slow
 def test_the_stepped_vehicle_is_the_one_that_drives_the_cars(tmp_path: Path) -> None:
     assert EFFECTS.keys() == OWN
     command = np.where(np.arange(400) // 80 % 2 == 0, 1.0, -1.5)  # one stop from 20 m/s is not reached

@@ -25,6 +25,7 @@ def surrogate(as_it_is: tuple[Log, Log]) -> Surrogate:
     return surrogate_of([as_it_is[1]])
 
 
+@pytest.mark.slow
 def test_the_surrogate_is_what_the_simulator_is_made_of(surrogate: Surrogate) -> None:
     """It has its own four effects and no other; sizes to a few per cent, as its equations are those of another hand."""
     found = surrogate

@@ -48,6 +48,7 @@ def test_masked_rows_and_noise_cost_information() -> None:
     assert float(noisy) < float(all_rows)
 
 
+@pytest.mark.slow
 def test_information_is_the_curvature_of_the_likelihood() -> None:
     """On the noise-free response the likelihood's Hessian in log K_L is the Fisher information, up to the slope.
 

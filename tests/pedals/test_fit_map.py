@@ -19,6 +19,7 @@ def plain_drive(request: pytest.FixtureRequest) -> tuple[Log, PedalFit]:
     return log, fit_pedals(log)
 
 
+@pytest.mark.slow
 def test_each_knot_is_within_its_own_errors(plain_drive: tuple[Log, PedalFit]) -> None:
     _, fit = plain_drive
     zero = np.zeros(1)
@@ -53,6 +54,7 @@ def test_a_map_is_off_by_less_than_wind_and_road(seed: int) -> None:
     assert np.sqrt(np.mean(off[log.usable] ** 2)) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_dead_zone_is_found_on_a_calm_day(seed: int) -> None:
     table = fit_pedals(drive(with_dead_zone, seed, force=0.02)).map.pedals["throttle"]

@@ -11,6 +11,7 @@ from benchmarks.blindtest.drives import ACCEL_MAX_MPS2, ACCEL_MIN_MPS2, MANOEUVR
 from benchmarks.blindtest.vehicle import simulate
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("manoeuvre", MANOEUVRES)
 def test_ordinary_drives(manoeuvre: str) -> None:
     rng = np.random.default_rng(3)

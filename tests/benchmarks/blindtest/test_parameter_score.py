@@ -162,12 +162,14 @@ def misfit(effect: str, given: dict[str, float], factor: float, start_speed: flo
     return float(np.sqrt(np.mean((found - shown)[settled] ** 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", PREDICTABLE)
 def test_a_size_means_the_same_to_the_vehicle_and_to_the_table(effect: str) -> None:
     less, same, more = (misfit(effect, PREDICTABLE[effect], factor) for factor in (0.9, 1.0, 1.1))
     assert same < 0.5 * min(less, more)
 
 
+@pytest.mark.slow
 def test_a_creep_that_fits_is_another_number_than_the_vehicles() -> None:
     # the same push at standstill, which no row shows
     factors = np.linspace(0.5, 1.2, 15)

@@ -243,6 +243,7 @@ def test_bad_seeds_rates_and_names_are_refused() -> None:
         draw_case(0, 1, recorder="poor")  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "more"),
     [

@@ -36,6 +36,7 @@ def off(replay: Replay, names: list[str]) -> tuple[float, float]:
     return float(np.sqrt(np.mean((response.accel - run.accel)[moving] ** 2))), float(speed.std())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORETOLD)
 def test_with_its_cause_it_is_the_drive(name: str, fresh_seed: int) -> None:
     replay = driven([name], fresh_seed, Car(T_L=0.4).silent())

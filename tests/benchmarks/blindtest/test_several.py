@@ -35,6 +35,7 @@ def test_three_to_five_that_can_be_seen(fresh_seed: int) -> None:
         draw_case(0, fresh_seed, effects=["gust", "dead_time", "outliers", "backlash", "command_hold"], **SHORT)
 
 
+@pytest.mark.slow
 def test_the_truth_divides_the_gap(fresh_seed: int) -> None:
     case = draw_case(1, fresh_seed, signals=("speed",), **SHORT)
     truth = json.loads(json.dumps(case.truth(), allow_nan=False))

@@ -87,6 +87,7 @@ def test_same_seed_same_log_and_another_seed_another() -> None:
     np.testing.assert_array_equal(drive(car=car, seed=5).noise_accel, one.noise_accel)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*EFFECTS, *CALIBRATION, *SEALED])
 def test_every_cause_vanishes_with_its_strength_and_shows_at_full(name: str) -> None:
     made = DrivePlan("stop_and_go" if name == "low_speed_creep" else "steps", 30.0, RATE, 8)
@@ -108,6 +109,7 @@ def test_every_cause_vanishes_with_its_strength_and_shows_at_full(name: str) -> 
     assert far[1] > 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*EFFECTS, *CALIBRATION, *SEALED])
 def test_before_its_onset_no_cause_leaves_a_trace(name: str) -> None:
     draw = family(name).draw(np.random.default_rng(1), CAR, DrivePlan("steps", 20.0, RATE, 1))

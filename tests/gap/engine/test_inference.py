@@ -76,6 +76,7 @@ def test_an_effect_is_found_with_its_size(effect: Effect, key: str, rotating_see
     assert found.onset_s is None
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_a_gain_that_fades_is_one_change_or_a_gain_that_wanders(rotating_seed: int) -> None:
     """A fade of half a minute is no step: in three drives of eight a course of the gain is likelier."""
@@ -88,6 +89,7 @@ def test_a_gain_that_fades_is_one_change_or_a_gain_that_wanders(rotating_seed: i
         says(found, "gain_change", {"gain_ratio": 0.65})
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_a_ring_has_its_size(rotating_seed: int) -> None:
     ringing = DrivelineOscillation(2.2, 0.6)

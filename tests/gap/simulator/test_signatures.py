@@ -30,6 +30,7 @@ def test_drawing_takes_an_axes() -> None:
     plt.close(figure)
 
 
+@pytest.mark.slow
 def test_overview_shows_all() -> None:
     figure = signature_figure()
     titles = {ax.get_title("left") or ax.get_title() for ax in figure.axes}

@@ -84,6 +84,7 @@ def test_two_cells_that_claim_a_sheet_of_400_gb(tmp_path: Path) -> None:
         open_recording(path)
 
 
+@pytest.mark.slow
 def test_a_process_that_ends_between_two_readings(tmp_path: Path, started: list[subprocess.Popen]) -> None:
     recording = open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
     recording.read(["log.speed"])
