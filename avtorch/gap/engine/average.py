@@ -5,8 +5,8 @@ free form of some family; all are valued in nats of the same likelihood. Each su
 is its effects by name. But an effect may be an error of the shape of the others, and then the label is without it; a
 free form may be that, too, or a cause without a name, `unknown`. Beside names a free form is a part without one, or all
 of them together describe one unknown cause: one cause is likelier than several, and a term of a description is cheaper
-than a cause. A force map of the base is a part without a name beside those that have one; there `unknown` is the label
-where no part has a name. Labels add up what supports them:
+than a cause. If the base has a force map, the map is such a part, and the label is `unknown` where nothing else is
+named. Labels add up what supports them:
 
     P(label) ~ sum exp(TEMPER (log evidence + log odds))
 """

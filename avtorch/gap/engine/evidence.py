@@ -48,7 +48,10 @@ def log_prior_density(h: Hypothesis) -> float:
 
 
 def evaluate_evidence(h: Hypothesis) -> Hypothesis:
-    """Sets what `Hypothesis` says, of an evaluated hypothesis over its base; returns it."""
+    """Laplace's approximation of the evidence of `h` over its base, and what else `Hypothesis` says is set here.
+
+    `h` was simulated at its most probable values; it is changed and returned. `information` is the Hessian H.
+    """
     base = h.base or h
     names = h.free
     h.jacobian, precision, _ = linearised(h, names)

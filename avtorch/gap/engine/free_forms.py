@@ -52,19 +52,19 @@ TONE_BACKGROUND_HZ = 0.25
 """Width [Hz] of the running median that is the noise around a line, at least 15 bins of the spectrum."""
 _LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
 _DELAY_STEP_S = 0.02  # of the finite difference in a delay: about the typical wandering
+_OF_LAGS = ("linear", "sided")  # forms in whose fit the car's own lag moves far
 
 
 @dataclass(frozen=True, eq=False)
 class FreeForm:
     """A linear family: `columns` (column, channel, frame, bin) are the responses to its demands of coefficient one.
 
-    `family`: where it acts ("force map", "dynamics", "time", "recorder"); `terms` (column,): each demand in words.
+    `terms` (column,): each demand in words; the family of a `name` is in `family.FORMS`.
     `sizes`: prior standard deviations of a coefficient, each with its log prior probability; several where there are
     more coefficients than any drive tells.
     """
 
     name: str
-    family: str
     columns: FloatArray = field(repr=False)
     terms: tuple[str, ...] = field(repr=False)
     sizes: tuple[tuple[float, float], ...] = ((COEFFICIENT_SD, 0.0),)
@@ -97,11 +97,10 @@ def families(h: Hypothesis) -> dict[str, FreeForm]:
     u = h["K_L"] * h.command()
     short, own, long, longest = _bank(h)
     up = np.maximum(u, 0.0)
-    demands: dict[tuple[str, str], list[tuple[str, FloatArray, float]]] = {
-        ("linear", "dynamics"): [("u", u, lag) for lag in (short, long, longest)],
-        ("sided", "dynamics"): [("u > 0", up, lag) for lag in (short, long, longest, own)],
+    forms = {
+        "linear": _form(h, "linear", [("u", u, lag) for lag in (short, long, longest)]),
+        "sided": _form(h, "sided", [("u > 0", up, lag) for lag in (short, long, longest, own)]),
     }
-    forms = {name: _form(h, name, family, each) for (name, family), each in demands.items()}
     # a gain by sign is a force map: at rest, lags by sign change nothing
     *others, car = forms["sided"].columns
     forms["sided"] = replace(forms["sided"], columns=np.array(others) - car, terms=forms["sided"].terms[:-1])
@@ -114,7 +113,7 @@ def map_free_form(h: Hypothesis, form: MapForm) -> FreeForm:
     """The curves of a force map as a form beside a hypothesis without one."""
     columns = demand_response(h, form.demands, np.full(form.count, h["T_L"]))
     sizes = tuple(zip(MAP_SIZES.tolist(), size_log_prior().tolist(), strict=True))
-    return FreeForm("map", "force map", columns, tuple(f"curve {k + 1}" for k in range(form.count)), sizes)
+    return FreeForm("map", columns, tuple(f"curve {k + 1}" for k in range(form.count)), sizes)
 
 
 def mirror_columns(h: Hypothesis) -> FreeForm:
@@ -122,7 +121,7 @@ def mirror_columns(h: Hypothesis) -> FreeForm:
     lags = np.array(_bank(h))
     demands = np.tile(h["K_L"] * h.command(), (len(lags), 1))
     columns = demand_response(h, demands, lags, backwards=True)
-    return FreeForm("mirror", "recorder", columns, tuple(f"lag -{lag:.2f} s" for lag in lags))
+    return FreeForm("mirror", columns, tuple(f"lag -{lag:.2f} s" for lag in lags))
 
 
 def block(h: Hypothesis, form: FreeForm, iterations: int = 4) -> FreeFormFit:
@@ -150,14 +149,14 @@ def block(h: Hypothesis, form: FreeForm, iterations: int = 4) -> FreeFormFit:
             best, size = moves, sd
     taken = np.tensordot(best[known:], form.columns, 1)
     over, residual = 0.0, h.residual - taken - np.tensordot(best[:known], h.jacobian, 1)
-    if form.family == "dynamics":
+    if form.name in _OF_LAGS:
         residual, over = _bent(h, best[:known], taken, residual)
     return FreeFormFit(log_sum(nats) - over, residual, best[known:], size)
 
 
 def _bent(h: Hypothesis, moves: FloatArray, taken: FloatArray, linear: FloatArray) -> tuple[FloatArray, float]:
-    """What is left with the unknowns of `h` where they were moved and what a form has `taken`, and how many nats the
-    `linear` residual promised beyond that: far from its place the response is no straight line in the parameters."""
+    """The residual without what a form has `taken`, simulated anew with the unknowns of `h` at their new values, and
+    how many nats more the `linear` residual had promised: a large step in a lag is not linear."""
     count = len(h.free)
     left = _moved(h, moves[:count]).residual - taken - np.tensordot(moves[count:], h.jacobian[count:], 1)
     return left, max(log_likelihood(h.data, linear)[0] - log_likelihood(h.data, left)[0], 0.0)
@@ -189,7 +188,7 @@ def tone(h: Hypothesis, fmin: float = 0.1) -> Tone:
     for c in range(data.channel_count):
         columns[c, :, c] = waves
     terms = tuple(f"{name}, {wave}" for name in data.channels for wave in ("cosine", "sine"))
-    fit = block(h, FreeForm("tone", "time", columns.reshape(-1, *columns.shape[2:]), terms))
+    fit = block(h, FreeForm("tone", columns.reshape(-1, *columns.shape[2:]), terms))
     return Tone(fit._replace(nats=fit.nats - math.log(tried)), frequency, data.channels[channel])
 
 
@@ -310,10 +309,10 @@ def _bank(h: Hypothesis) -> tuple[float, ...]:
     return tuple(max(h["T_L"] * ratio, SHORTEST_LAG_S) for ratio in LAG_RATIOS)
 
 
-def _form(h: Hypothesis, name: str, family: str, demands: Sequence[tuple[str, FloatArray, float]]) -> FreeForm:
+def _form(h: Hypothesis, name: str, demands: Sequence[tuple[str, FloatArray, float]]) -> FreeForm:
     """A form from its demands: what each is, its rows (row,), and the lag [s] behind it."""
     columns = demand_response(h, np.array([w for _, w, _ in demands]), np.array([lag for *_, lag in demands]))
-    return FreeForm(name, family, columns, tuple(f"{term}, lag {lag:.2f} s" for term, _, lag in demands))
+    return FreeForm(name, columns, tuple(f"{term}, lag {lag:.2f} s" for term, _, lag in demands))
 
 
 def _first_order_backwards(
@@ -359,7 +358,7 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float, iterations: int =
         over = min(claimed(data, after) - claimed(data, h.covariance), total - h.log_likelihood)
         return over + float(pull @ moves - 0.5 * precision @ moves**2), after
 
-    # at a crease of the likelihood the parameters alone promise something: that is no course's
+    # at a crease of the likelihood moved parameters alone gain something, which is not to the course's credit
     white = np.array([whiten(data, h.covariance, j) for j in h.jacobian])
     score = white @ whiten(data, h.covariance, h.residual) + pull
     alone = np.asarray(np.linalg.solve(white @ white.T + np.diag(precision), score), np.float64)

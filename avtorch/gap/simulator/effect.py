@@ -15,7 +15,8 @@ drive: only the shapes differ. With memory it is `start` and `advance`, one row 
 Without `over` the rows are looped over, which is correct but slow.
 
 That, a name, an equation and parameters with units and priors are all that an effect needs. What it may bring besides
-is listed at `Effect`. What can be computed from its response is not declared: `effect_response`.
+is listed at `Effect`. What can be computed from its response, such as its aliases, is not declared but computed
+(`effect_response`).
 """
 
 from __future__ import annotations

@@ -172,7 +172,7 @@ def test_evidence_does_not_depend_on_the_basis(fresh_seed: int) -> None:
     h = _car(_cubic)
     form = families(h)["sided"]
     rotation = np.linalg.qr(np.random.default_rng(fresh_seed).normal(size=(len(form.columns),) * 2))[0]
-    turned = FreeForm("sided", "dynamics", np.tensordot(rotation, form.columns, 1), form.terms)
+    turned = FreeForm("sided", np.tensordot(rotation, form.columns, 1), form.terms)
     one, other = block(h, form), block(h, turned)
     assert other.nats == pytest.approx(one.nats, abs=1e-6)
     np.testing.assert_allclose(other.coefficients, rotation @ one.coefficients, atol=1e-6)
@@ -182,7 +182,7 @@ def test_what_the_parameters_already_do_gains_nothing() -> None:
     """A form in the span of the Jacobian: its coefficient and the gain's own share what little is left. The gain's sd
     is 0.5; with another 0.35 beside it, the prior is wider, and the posterior as narrow."""
     h = _car(_lags)
-    again = FreeForm("gain", "force map", h.jacobian[h.free.index("K_L")][None], ("K_L",))
+    again = FreeForm("gain", h.jacobian[h.free.index("K_L")][None], ("K_L",))
     found = block(h, again)
     wider = 0.5 * math.log(1.0 + (0.35 / 0.5) ** 2)
     assert found.nats == pytest.approx(-wider, abs=0.2)  # what the prior's mean is away from the fit
