@@ -279,7 +279,7 @@ def _table(
     changes as a share of the column's largest value (column,); None where the spans are too few."""
     last = _DELAYS_S[-1]
     starts = [np.arange(clock[p][0] + last, clock[p][-1] - span, span / 4) for p in parts if p.stop - p.start > 2]
-    if not starts or sum(map(len, starts)) < 4 * MIN_SPANS:
+    if not values or sum(map(len, starts)) < 4 * MIN_SPANS:
         return None
     changes, integrals, sizes = [], [], []
     used = [part for part in parts if part.stop - part.start > 2]

@@ -93,3 +93,11 @@ def test_lines_before_the_header_may_be_padded(tmp_path: Path, fresh_seed: int) 
     path = written(tmp_path, columns, before="Recorder 7,,,\nDate,2026-01-01,,\n")
     assert avtorch.check(path).fault is None
     assert np.array_equal(Log.read(path).speed, drive(fresh_seed)["speed"])
+
+
+def test_a_log_of_its_times_alone_is_asked_about(tmp_path: Path) -> None:
+    (tmp_path / "drive.csv").write_text("\n".join(["time", *(f"{0.05 * i:.2f}" for i in range(400))]))
+    found = avtorch.check(tmp_path / "drive.csv")
+    assert found.log is None
+    assert found.proposal is not None
+    assert found.proposal.map == {"time": "time"}
