@@ -63,7 +63,7 @@ def test_any_table_is_checked_or_refused(
     if found is None:
         return
     assert all(note.isprintable() for note in found.notes)
-    assert (found.log is None) == (found.fault is not None)
+    assert found.log is not None or found.fault is not None  # one that holds too little has both
     assert found.proposal is not None
     written = found.proposal.toml("drive.csv")
     assert tomllib.loads(written).get("map", {}) == found.proposal.map
