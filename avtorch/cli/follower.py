@@ -98,6 +98,9 @@ def print_diagnosis(talk: Talk, found: Diagnosis, *, verbose: bool = False) -> N
         talk.lines([text], "yellow")
     if verbose:
         talk.lines([*sentences.tested(found), *sentences.budget(found)])
+    elif found.budget is not None and found.budget.rest:
+        talk.lines([found.budget.rest])
+    if verbose:
         talk.lines([found.verdict.why], "dim")
     talk.line("")
     budget = found.budget

@@ -79,7 +79,7 @@ def report_html(
         f"{log.name} · {log.seconds:.0f} s at {log.rate_hz:.3g} Hz",
         Section(
             sentences.headline(found),
-            (*odd, *(() if found.complete else (_PROVISIONAL,))),
+            (*_rest(found), *odd, *(() if found.complete else (_PROVISIONAL,))),
             tuple(p for p in (_budget(found), _free_form(found), _drive(found), _road(found)) if p is not None),
         ),
         (
@@ -146,8 +146,14 @@ def _one(picture: Picture | None) -> tuple[Picture, ...]:
 
 
 # the verdict -------------------------------------------------------------------------------------------------------
+def _rest(found: Diagnosis) -> tuple[str, ...]:
+    """What the error that is left is, beside the headline."""
+    return () if found.budget is None or not found.budget.rest else (found.budget.rest,)
+
+
 def _words(found: Diagnosis) -> list[str]:
-    lines = [*sentences.tested(found), *sentences.budget(found), found.verdict.why, sentences.aliases(found)]
+    told = [line for line in sentences.budget(found) if line not in _rest(found)]
+    lines = [*sentences.tested(found), *told, found.verdict.why, sentences.aliases(found)]
     lines += [*sentences.onset(found), *sentences.shrinkage(found)]
     if found.setting is not None:
         why = str(found.setting["why"])

@@ -77,5 +77,5 @@ def test_its_caption_says_whether_what_is_left_counts(found: Diagnosis) -> None:
 
 def test_a_log_that_cannot_tell_noise_says_so(found: Diagnosis) -> None:
     first = picture(unnamed(found, "none", 1.0, Quantity(0.0, 0.1, 0.0, 1.0)))
-    assert "this log is too short to tell" in first.caption
+    assert "this log cannot tell" in first.caption
     assert [row[1] for row in first.tables[0].rows] == ["0 % (0 to 100)", "100 % (0 to 100)"]

@@ -169,7 +169,7 @@ class Unexplained:
             return "noise"
         low, high = (round(100 * x) for x in (self.still.q05, self.still.q95))
         if low == 0 and high == 100:
-            return "noise or what a black box may still foretell: this log is too short to tell"
+            return "noise or what a black box may still foretell: this log cannot tell"
         if high == 100:  # the log bounds it from below alone
             return f"noise but for {low} % or more, which a black box may still foretell"
         return f"noise but for {low} to {high} %, which a black box may still foretell"
@@ -265,12 +265,23 @@ class Budget:
             return str(self)
         return self._sentence(lead=f"That is {percent(self.parts[0].share.mean)} of the gap")
 
+    @property
+    def rest(self) -> str:
+        """A sentence on the error that is left, beside the named causes; empty without any, where `str()` tells it."""
+        if not self.names:
+            return ""
+        by_chance = " and ".join(_words(c) for c in self.chance if c.probability >= LIKELY)
+        noise = self.unexplained.rest(self.material)
+        return f"The rest of the error is {f'in part this: {by_chance}; else {noise}' if by_chance else noise}."
+
     def _sentence(self, lead: str) -> str:
-        """The named parts and the force without a name that the repaired simulator carries, the largest first, then
-        what is left."""
+        """The named parts and the force without a name that the repaired simulator carries, the largest first; small
+        ones by their names alone."""
         named = [p for p in self.parts if p.probability >= LIKELY]
         large = [p for p in named if p.share.mean >= self.material] or named[:1]
-        small = [_words(p) for p in named if p not in large]
+        small = [
+            p.name if p.plausible else f"{p.name} (physically implausible as fitted)" for p in named if p not in large
+        ]
         shares = [(p.share.mean, _words(p, f"{percent(p.share.mean)} of the gap")) for p in large]
         lines = []
         if lead:
@@ -281,7 +292,7 @@ class Budget:
         if words:
             lines.append(f"{'' if lead else 'chiefly '}{', then '.join(words)}")
         if small:
-            lines.append(f"{listing(small)} with under {percent(self.material)}{' each' if small[1:] else ''}")
+            lines.append(f"under {percent(self.material)}{' each' if small[1:] else ''}: {listing(small)}")
         rest = self.unexplained.beyond_carried.mean
         if rest >= 0.005 and named:
             if not lead and rest > max(share for share, _ in shares):
@@ -289,10 +300,6 @@ class Budget:
                 lines.insert(0, f"chiefly no known effect explains it ({percent(rest)} of the gap)")
             else:
                 lines.append(f"{percent(rest)} is reproducible and no known effect explains it")
-        by_chance = [_words(c) for c in self.chance if c.probability >= LIKELY]
-        noise = self.unexplained.rest(self.material)
-        noise = noise if not by_chance else f"in part this: {' and '.join(by_chance)}; else {noise}"
-        lines.append(f"the rest of the error is {noise}")
         text = "; ".join(lines) + "."
         return text[0].upper() + text[1:]
 

@@ -109,8 +109,11 @@ def tested(found: Findings) -> list[str]:
 
 def budget(found: Findings) -> list[str]:
     """The sentence on the budget of the gap, and what it divides."""
-    if found.budget is None or not found.budget.parts:
+    if found.budget is None:
         return []
+    beside = [found.budget.rest] if found.budget.rest else []
+    if not found.budget.parts:
+        return beside
     verb = "cut" if all(e.left < e.before for e in found.budget.by_channel.values()) else "take"
     cut = f"this effect {verb}s" if len(found.budget.names) == 1 else f"these effects {verb}"
     if found.free_form is not None:
@@ -125,6 +128,7 @@ def budget(found: Findings) -> list[str]:
         floors.append(f"{error.floor:.2g} {_UNIT[name]}")
     return [
         *line,
+        *beside,
         f"In simulations of {found.budget.horizon_s:.3g} s from the logged commands, on parts of the drive not used "
         f"for fitting, {cut} the error {' and '.join(errors)}"
         + (f"; noise alone makes {' and '.join(floors)}." if rest == "noise" else "."),

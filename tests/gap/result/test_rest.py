@@ -17,4 +17,4 @@ def test_it_is_noise_only_where_no_black_box_could_take_off_what_matters() -> No
     assert rest(0.0, 0.3).startswith("noise but for 0 to 30 %")
     # a log that bounds it from below alone, or not at all
     assert rest(0.03, 1.0) == "noise but for 3 % or more, which a black box may still foretell"
-    assert rest(0.0, 1.0).endswith("this log is too short to tell")
+    assert rest(0.0, 1.0).endswith("this log cannot tell")
