@@ -491,7 +491,8 @@ class FittedForm:
 def fitted_form(h: Hypothesis, baseline: GapPlant | None, bare: Hypothesis) -> FittedForm | None:
     """The free form beside a hypothesis (its force map, if any, apart) that does best on blocks left out.
 
-    `bare`: what it is scored over. None where no speed was measured, or blocks are too few.
+    `bare`: what it is scored over. None where no speed was measured, blocks are too few, or their speed falls as the
+    command rises.
     """
     if h.data.speed is None:
         return None
@@ -513,6 +514,8 @@ def fitted_form(h: Hypothesis, baseline: GapPlant | None, bare: Hypothesis) -> F
     best = best_form(car, left, over, independent)
     x, sizes = best.fit.x, best.sizes
     at = Coefficients.of(x[:-1], car.rows.shape)
+    if h["K_L"] + at.gain <= 0:  # the free runs follow no command
+        return None
     form = FreeForm(car.rows.knots_u, car.rows.knots_v, at, sizes, float(np.exp(x[-1])))
     return FittedForm(h, form, best.score, as_it_is(car), as_it_is(base), car, x, independent)
 

@@ -199,7 +199,9 @@ def shrinkage_of(held: HeldOut, seed: int = 0) -> Shrinkage:
         drawn = np.sqrt(squares[:, pick].sum(-1) / sizes[pick].sum(-1))
         name = f"rollout_rmse_{channel}"
         out[name], ceiling[name] = _metric(rms, drawn, held.horizon_s), float(rms[3])
-    rows, nats = held.frame_rows, np.stack([x.nats for x in four])
+    framed = np.flatnonzero(held.frame_rows)  # a block between two frames has no density
+    rows, nats = held.frame_rows[framed], np.stack([x.nats[framed] for x in four])
+    pick = np.random.default_rng(seed).integers(0, len(framed), (RESAMPLES, len(framed)))
     mean = nats.sum(1) / rows.sum()
     drawn = nats[:, pick].sum(-1) / rows[pick].sum(-1)
     # the measure in which the gap shows most

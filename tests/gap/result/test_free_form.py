@@ -118,3 +118,15 @@ def test_a_gain_of_free_runs_is_handed_back_where_the_evidences_errs(fresh_seed:
     drive = SimulatorInput(*map(torch.as_tensor, (time, slow, np.full_like(time, 20.0))))
     there = back.response(drive).accel.numpy()
     assert abs(float(there @ accel / (accel @ accel)) - 1.0) < 0.25 * abs(base["K_L"] - 1.0)
+
+
+def test_a_speed_that_falls_as_the_command_rises_has_no_free_form() -> None:
+    """As in the second half of a truck's drive on a grade: no car has a negative gain, and no table makes up for it."""
+    time, rng = 0.05 * np.arange(2400), np.random.default_rng(1)
+    command = np.sin(0.3 * time) + 0.7 * np.sin(0.11 * time)
+    accel = lfilter([0.02], [1, -0.98], rng.normal(0.0, 2.0, 2400))  # a road; or else the sign is refused as wrong
+    accel -= 0.15 * lfilter([0.1], [1, -0.9], command)
+    speed = 20 + 0.05 * np.cumsum(accel) + 0.01 * rng.normal(size=len(time))
+    log = Log.from_arrays(time=time, accel_cmd=command, accel=accel + 0.05 * rng.normal(size=len(time)), speed=speed)
+    base = fit(base_fit(DriveData.of(log)))
+    assert fitted_form(base, plant([]), base) is None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import avtorch
 from avtorch.errors import InputError
 from avtorch.gap import ConstantResistance, DeadBand, DeadTime, Effect, SensorBias
 from avtorch.gap.result.budget import Budget
+from avtorch.gap.result.gap_budget import shrinkage_of
+from avtorch.gap.result.held_out import Scores
 from tests.gap.cars import log_of
 
 FEW = ["dead_time", "dead_band", "constant_resistance", "sensor_bias", "sensor_scale", "gust"]
@@ -94,3 +97,15 @@ def test_wrong_arguments_are_refused() -> None:
         budget_of(log, effects=["dead_tim"])
     with pytest.raises(InputError, match="needs 12 s"):
         budget_of(log_of(seconds=7.0), effects=FEW)
+
+
+def test_blocks_without_a_frame_have_no_share_in_the_density() -> None:
+    """A stop-and-go drive of few frames: resampled blocks need not hold one."""
+    each = [Scores(np.full((1, 6), x), np.where(np.arange(6) == 2, -x, 0.0)) for x in (4.0, 1.0, 1.0)]
+    blocks = SimpleNamespace(rows=[None] * 6, sizes=np.full(6, 100.0), by_drives=False)
+    given = {"steps": each[:2], "floor": each[2], "ceiling": each[2], "frame_rows": np.array([0, 0, 50.0, 0, 0, 0])}
+    held = SimpleNamespace(blocks=blocks, data=SimpleNamespace(channels=("speed",)), horizon_s=10.0, **given)
+    density = shrinkage_of(cast(Any, held)).by_metric["log_predictive_density"]
+    assert (density.before, density.after) == (-0.08, -0.02)
+    assert density.closed is not None
+    assert density.closed.q05 == density.closed.q95 == 1.0
