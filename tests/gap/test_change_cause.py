@@ -14,11 +14,13 @@ from scipy.stats import binom
 import avtorch
 from avtorch.errors import InputError
 from avtorch.gap import ConstantResistance, DeadTime, Effect, SensorBias, plant
+from avtorch.gap.engine.coordinates import EFFECTS
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.joint import JointModel, block_scores, of_car
+from avtorch.gap.engine.joint import JointModel, block_scores, of_car, of_effect
 from avtorch.gap.engine.likelihood import whiten
+from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.cause_of_change import cause_of_change
+from avtorch.gap.result.cause_of_change import _of_effect, cause_of_change
 from avtorch.gap.result.comparison import ChangeCause, ChangePart, Comparison, detectable_text
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.io import Log
@@ -260,3 +262,10 @@ def test_two_laps_of_one_car_name_no_cause(one: str, two: str, data_dir: Path) -
     assert comparison.cause.names == ()
     assert not comparison.changed
     assert "No change is named" in comparison.why or "No cause is named" in comparison.why
+
+
+def test_a_limit_out_of_reach_is_not_reported() -> None:
+    h = base_fit(DriveData.of(log_of([])))
+    h.effects.append("saturation")
+    h["drive_limit"], h["brake_limit"] = 4e-9, 0.6
+    assert list(_of_effect(h, of_effect(EFFECTS["saturation"], (), less=False))) == ["accel_min_mps2"]

@@ -124,12 +124,20 @@ def _reported(model: JointModel, fit: JointFit, change: Change, x: FloatArray) -
 
 def _of_effect(h: Hypothesis, change: Change) -> dict[str, float]:
     effect = table_effect(h, change.effect)
-    neutral = {q.name: q.neutral for q in effect.coordinates()}
+    own = {q.name: q for q in effect.coordinates()}
     out = {}
     for key, value in effect.report(torch.tensor([h["T_L"]], dtype=torch.float64)).items():
-        x = torch.as_tensor(value).reshape(-1)
-        if len(x) == 1 and math.isfinite(float(x[0])):
-            out[key] = -float(x[0]) if change.less and neutral.get(key) == 0.0 else float(x[0])
+        x, q = torch.as_tensor(value).reshape(-1), own.get(key)
+        if len(x) != 1 or not math.isfinite(float(x[0])):
+            continue
+        if (
+            q is not None
+            and q.neutral is not None
+            and math.isinf(q.neutral)
+            and abs(float(x[0])) > max(map(abs, q.physical))
+        ):
+            continue  # a limit out of reach
+        out[key] = -float(x[0]) if change.less and q is not None and q.neutral == 0.0 else float(x[0])
     return out
 
 
