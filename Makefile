@@ -1,5 +1,5 @@
 # Two commands on a fresh machine: `make demo` and `make test`. `make test-all` adds the slow tests,
-# `make fuzz` tries 100,000 damaged inputs (about half an hour), `make soak` drives 100 simulated cars for a week;
+# `make fuzz` tries 100,000 damaged inputs (an hour and a quarter), `make soak` drives 100 simulated cars for a week;
 # `make nightly` is all of these, the soak for two hours.
 PYTHON ?= python3
 VENV ?= .venv
