@@ -61,7 +61,7 @@ def channel_transfer(h: Hypothesis, frequency: FloatArray) -> ComplexArray:
         else:  # the central difference of a speed that the recorder may hold for some rows
             delay += 0.5 * (data.hold - 1) * data.dt
             gain = np.sinc(2 * frequency * data.dt) / (1 + 1j * omega * coordinate_from_start(h, "speed_lag"))
-        keep, new, old = one_pole(max(pole, 1e-4), data.dt)
+        keep, new, old = one_pole(max(pole, 1e-4), np.array(data.dt))
         row = np.exp(-1j * omega * data.dt)
         shown.append(gain * np.exp(-1j * omega * delay) * (new + old * row) / (1 - keep * row))
     return np.array(shown)

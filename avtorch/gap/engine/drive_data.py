@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import copy
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Self
@@ -49,10 +48,10 @@ class Grid:
     accel0: FloatArray = field(repr=False)
 
 
-def one_pole(time_constant: float, dt: float) -> tuple[float, float, float]:
-    """y_k = keep y_{k-1} + new x_k + old x_{k-1}: one pole, exact where x is straight between rows of `dt` [s]."""
-    keep = math.exp(-dt / time_constant)
-    held = time_constant / dt * (1 - keep)
+def one_pole(time_constant: float, step: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """y_k = keep y_{k-1} + new x_k + old x_{k-1}: one pole, exact where x is straight between rows `step` [s] apart."""
+    keep = np.exp(-step / time_constant)
+    held = time_constant / step * (1 - keep)
     return keep, 1 - held, held - keep
 
 
@@ -325,7 +324,17 @@ class DriveData:
         """One pole of this time constant [s], at rest at the start of each stretch (see `one_pole`)."""
         if time_constant < 1e-4:
             return x
-        return _filtered(np.ascontiguousarray(x), self.bounds, *one_pole(time_constant, self.dt))
+        gaps, steps = self.gaps
+        return filtered(np.ascontiguousarray(x), self.bounds, gaps, *one_pole(time_constant, steps))
+
+    @property
+    def gaps(self) -> tuple[IntArray, FloatArray]:
+        """Rows (row,) that were lost in front of each, and the steps [s] for none, one, and so on."""
+        if "gaps" not in self.cache:
+            lost = np.maximum(np.diff(self.count, prepend=self.count[:1]), 1) - 1
+            lost[self.bounds[:-1]] = 0
+            self.cache["gaps"] = lost, self.dt * np.arange(1.0, lost.max() + 2)
+        return self.cache["gaps"]
 
     # inside ----------------------------------------------------------------------------------------------------------
     def _measured(self) -> FloatArray:
@@ -474,14 +483,16 @@ def _fold(x: FloatArray, begins: IntArray, window: FloatArray, out: FloatArray) 
 
 
 @njit(cache=True, error_model="numpy")
-def _filtered(  # pragma: no cover - compiled
-    x: FloatArray, bounds: IntArray, keep: float, new: float, old: float
+def filtered(  # pragma: no cover - compiled
+    x: FloatArray, bounds: IntArray, gaps: IntArray, keep: FloatArray, new: FloatArray, old: FloatArray
 ) -> FloatArray:
+    """`x` (row,) behind a pole whose coefficients (gap,) depend on the rows lost in front of each row (`gaps`)."""
     out = np.empty(len(x))
     for s in range(len(bounds) - 1):
         out[bounds[s]] = x[bounds[s]]
         for i in range(bounds[s] + 1, bounds[s + 1]):
-            out[i] = keep * out[i - 1] + new * x[i] + old * x[i - 1]
+            k = gaps[i]
+            out[i] = keep[k] * out[i - 1] + new[k] * x[i] + old[k] * x[i - 1]
     return out
 
 

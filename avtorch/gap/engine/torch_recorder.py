@@ -7,16 +7,16 @@ delay reads between points of the grid, so that the gradient in it jumps where a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, cast
 
 import numpy as np
 import torch
-from scipy.signal import lfilter
+from numba import njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from avtorch.gap.engine.drive_data import DriveData
+from avtorch.arrays import FloatArray, IntArray
+from avtorch.gap.engine.drive_data import DriveData, filtered
 from avtorch.gap.engine.torch_plant import Values
 
 
@@ -70,10 +70,10 @@ class TorchRecorder:
         return _read(x, *_between(self.grid_time, self.time - delay[..., None]))
 
     def _low_pass(self, x: Tensor, time_constant: Tensor) -> Tensor:
-        tau = time_constant.clamp_min(1e-4)
-        keep = torch.exp(-self.data.dt / tau)
-        held = tau / self.data.dt * (1 - keep)
-        none = time_constant < 1e-4
+        tau, step = time_constant.clamp_min(1e-4)[..., None], torch.as_tensor(self.data.gaps[1])
+        keep = torch.exp(-step / tau)
+        held = tau / step * (1 - keep)
+        none = (time_constant < 1e-4)[..., None]
         pole = [torch.where(none, x, y) for x, y in ((0.0, keep), (1.0, 1 - held), (0.0, held - keep))]
         return cast(Tensor, _OnePole.apply(x, *pole, self.data))
 
@@ -93,31 +93,51 @@ def _read(x: Tensor, index: Tensor, share: Tensor) -> Tensor:
 
 
 class _OnePole(torch.autograd.Function):
-    """`drive_data.one_pole`, from y = x at the start of a stretch on; x (column, row), coefficients (column,)."""
+    """`drive_data.filtered`; x (column, row), coefficients (column, gap)."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, keep: Tensor, new: Tensor, old: Tensor, data: DriveData) -> Tensor:
         rows, pole = x.detach().numpy(), [c.detach().numpy() for c in (keep, new, old)]
-        y = np.empty_like(rows)
-        for column, (k, n, o) in enumerate(zip(*pole, strict=True)):
-            for i, j in pairwise(data.bounds):
-                y[column, i:j] = lfilter([n, o], [1, -k], rows[column, i:j], zi=[(1 - n) * rows[column, i]])[0]
+        y = np.array([filtered(row, data.bounds, data.gaps[0], *own) for row, *own in zip(rows, *pole, strict=True)])
         ctx.x, ctx.y, ctx.pole, ctx.data = rows, y, pole, data
         return torch.as_tensor(y)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        g, on_x, on_pole = gradient.numpy(), np.empty_like(ctx.x), np.zeros((3, len(ctx.x)))
-        for column, (k, n, o) in enumerate(zip(*ctx.pole, strict=True)):
-            for i, j in pairwise(ctx.data.bounds):
-                costate = lfilter([1.0], [1, -k], g[column, i:j][::-1])[::-1]
-                x, y, later = ctx.x[column, i:j], ctx.y[column, i:j], costate[1:]
-                on_x[column, i:j] = n * costate
-                on_x[column, i] = costate[0]
-                on_x[column, i : j - 1] += o * later
-                on_pole[:, column] += later @ y[:-1], later @ x[1:], later @ x[:-1]
-        return torch.as_tensor(on_x), *torch.as_tensor(on_pole), None
+        data, on_x, on_pole = ctx.data, [], []
+        for g, x, y, *pole in zip(gradient.numpy(), ctx.x, ctx.y, *ctx.pole, strict=True):
+            for into, one in zip((on_x, on_pole), _adjoint(g, x, y, data.bounds, data.gaps[0], *pole), strict=True):
+                into.append(one)
+        return torch.as_tensor(np.array(on_x)), *torch.as_tensor(np.array(on_pole)).movedim(1, 0), None
+
+
+@njit(cache=True, error_model="numpy")
+def _adjoint(  # pragma: no cover - compiled
+    g: FloatArray,
+    x: FloatArray,
+    y: FloatArray,
+    bounds: IntArray,
+    gaps: IntArray,
+    keep: FloatArray,
+    new: FloatArray,
+    old: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Gradients on x (row,) and on the coefficients (keep, new, old; gap) of `drive_data.filtered`, from `g` (row,)."""
+    on_x, on_pole = np.zeros(len(x)), np.zeros((3, len(keep)))
+    for s in range(len(bounds) - 1):
+        costate = 0.0
+        for i in range(bounds[s + 1] - 1, bounds[s], -1):
+            k = gaps[i]
+            costate += g[i]
+            on_x[i] += new[k] * costate
+            on_x[i - 1] += old[k] * costate
+            on_pole[0, k] += costate * y[i - 1]
+            on_pole[1, k] += costate * x[i]
+            on_pole[2, k] += costate * x[i - 1]
+            costate *= keep[k]
+        on_x[bounds[s]] += costate + g[bounds[s]]
+    return on_x, on_pole
 
 
 class _Transform(torch.autograd.Function):

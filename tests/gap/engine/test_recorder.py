@@ -18,6 +18,21 @@ def test_a_ramp_passes_a_pole_exactly_at_any_rate(time_constant: float) -> None:
     np.testing.assert_allclose(data.low_pass(t, time_constant), expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("time_constant", [0.02, 0.064, 0.3])
+def test_it_does_though_rows_are_lost(time_constant: float, fresh_seed: int) -> None:
+    log = recorded_log(rate_hz=20)
+    kept = np.random.default_rng(fresh_seed).random(log.rows) > 0.05
+    kept[:2] = True  # a first step that is the usual one
+    assert log.accel_cmd is not None
+    signals = {"accel_cmd": log.accel_cmd, "accel": log.accel, "speed": log.speed}
+    rest = {name: x[kept] for name, x in signals.items() if x is not None}
+    data = DriveData.of(Log.from_arrays(time=log.time[kept], **rest))
+    assert data.gaps[0].max() > 0
+    t = data.time - data.time[0]
+    expected = t - time_constant * (1 - np.exp(-t / time_constant))
+    np.testing.assert_allclose(data.low_pass(t, time_constant), expected, atol=1e-9)
+
+
 def test_what_explains_has_to_gain_below_half_of_what_rows_resolve() -> None:
     for rate_hz, claim_hz in ((10.0, 2.5), (20.0, 5.0), (100.0, 10.0)):
         assert fitted_hypothesis(recorded_log(rate_hz=rate_hz, seconds=30.0)).data.claim_hz == pytest.approx(claim_hz)
