@@ -24,6 +24,8 @@ The columns: `top-1`, share of all cases whose verdict is exactly the truth (90 
 `accused`: cars without a cause whose verdict is not `none`; `ECE`, and what it would be by chance were all
 probabilities right; wall and processor seconds an answer; `onset`: median error [s] where the verdict is right. A
 method that fails has answered wrongly.
+
+``--picture FILE`` draws how often the most probable hypothesis is right, in fifths of the cases by its probability.
 """
 
 from __future__ import annotations
@@ -40,9 +42,11 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from avtorch.errors import InputError
 from avtorch.io import Log, write_json
+from avtorch.plots.style import BLUE, GREY, VERMILLION, styled
 from benchmarks.blindtest import MIX, TIERS, draw_case, score
 from benchmarks.blindtest.answers import Answered, read_answer
 from benchmarks.blindtest.cases import SIGNALS, Recording
@@ -53,6 +57,7 @@ from benchmarks.blindtest.trial import ask
 RECORDERS: tuple[Recording, ...] = get_args(Recording)
 TIERS_TRIED = ("easy", "medium", "hard")
 _RESAMPLES = 200
+_FIFTHS = 5
 _PROBABLE = 4  # hypotheses that are shown of a wrong answer
 
 
@@ -277,6 +282,36 @@ def print_comparison(scored: Sequence[Scored], others: Mapping[str, Scored], nam
             )
 
 
+@styled
+def draw_reliability(scored: Sequence[Scored]) -> Figure:
+    """Share of cases whose most probable hypothesis is right against its probability, in fifths of the cases of each
+    recorder; 90 % intervals by Wilson."""
+    figure = Figure(figsize=(4.2, 3.8), layout="constrained")
+    ax = figure.add_subplot()
+    ax.plot([0, 1], [0, 1], color=GREY, lw=0.8, label="as stated")
+    for recorder, colour, marker in zip(RECORDERS, (BLUE, VERMILLION), "os", strict=True):
+        rows = [one.row for one in scored if one.place.recorder == recorder]
+        best = [(max(row.probabilities, key=lambda name: row.probabilities[name]), row) for row in rows]
+        some = sorted(
+            (row.probabilities[name], set(name.split("+")) == set(row.truth.split("+"))) for name, row in best
+        )
+        for number, fifth in enumerate(np.array_split(np.array(some, float).reshape(-1, 2), _FIFTHS)):
+            if len(fifth):
+                low, high = wilson(round(fifth[:, 1].sum()), len(fifth)) or (0.0, 1.0)
+                stated, right = fifth.mean(0)
+                label = f"{recorder} recorder" if not number else None
+                ax.plot([stated, stated], [low, high], color=colour, lw=1.0)
+                ax.plot(stated, right, marker, color=colour, label=label)
+    ax.set(
+        xlabel="probability of the most probable hypothesis",
+        ylabel="share that is right",
+        xlim=(0, 1.02),
+        ylim=(0, 1.02),
+    )
+    ax.legend(frameon=False, loc="upper left")
+    return figure
+
+
 def options(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("function", nargs="?", default="", help="MODULE:FUNCTION that answers (none: draw only)")
@@ -293,6 +328,7 @@ def options(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, choices=(1, 2), default=1)
     parser.add_argument("--again", action="store_true", help="answer again what was answered")
     parser.add_argument("--stored", action="store_true", help="answer nothing, score what is stored")
+    parser.add_argument("--picture", type=Path, help="draw how far probabilities hold")
     parser.add_argument("--against", default="", help="name of stored answers to compare with, case by case")
     return parser.parse_args(arguments)
 
@@ -318,6 +354,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     measures = print_table(scored)
     if not chosen.only:
         write_json(cell.out / "answers" / method.name / "score.json", measures)
+    if chosen.picture:
+        draw_reliability(scored).savefig(chosen.picture)
     others = {one.place.label: one for one in stored(places, chosen.against)} if chosen.against else {}
     print_misses(scored, others)
     if others:
