@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -269,3 +269,19 @@ def test_a_limit_out_of_reach_is_not_reported() -> None:
     h.effects.append("saturation")
     h["drive_limit"], h["brake_limit"] = 4e-9, 0.6
     assert list(_of_effect(h, of_effect(EFFECTS["saturation"], (), less=False))) == ["accel_min_mps2"]
+
+
+def test_a_side_has_its_own_rows_of_all_that_has_rows() -> None:
+    """`count` was the whole's: the recorder of the side after lost other rows, and held a speed from another one on."""
+    before, after = (log_of([], seed=seed) for seed in (1, 2))
+    lost = np.ones(after.rows, bool)
+    lost[100::40] = False
+    assert after.accel_cmd is not None
+    own = {"accel_cmd": after.accel_cmd, "accel": after.accel, "speed": after.speed}
+    after = Log.from_arrays(time=after.time[lost], **{k: x[lost] for k, x in own.items() if x is not None})
+    whole = DriveData.of([before, after])
+    rows = {f.name for f in fields(DriveData) if np.shape(getattr(whole, f.name))[:1] == whole.time.shape}
+    assert {"count", "command", "position"} <= rows
+    for side in JointModel.of(whole, 1, None).sides:
+        assert all(len(getattr(side, name)) == len(side.time) for name in rows)
+        np.testing.assert_allclose(side.low_pass(side.time - side.time[0], 0.1)[-1], side.time[-1] - side.time[0] - 0.1)
