@@ -71,7 +71,8 @@ class SideData(DriveData):
         frames = [(i - first, n) for i, n in whole.frames if first <= i < last]
         frame_rows = np.concatenate([np.full(n, first <= i < last) for i, n in whole.frames])
         cut = {f.name: getattr(whole, f.name) for f in fields(DriveData)}
-        for name in ("time", "stamp", "log", "source", "count", "command", "accel", "speed", "smooth_speed", "position"):
+        by_row = ("time", "stamp", "log", "source", "count", "command", "accel", "speed", "smooth_speed", "position")
+        for name in by_row:
             cut[name] = None if cut[name] is None else cut[name][first:last]
         cut["raw_accel"] = None if whole.raw_accel is None else whole.raw_accel[first:last]
         inside = (whole.bounds >= first) & (whole.bounds <= last)
