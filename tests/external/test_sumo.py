@@ -56,7 +56,7 @@ def test_sumo_drives_what_was_exported(types: Path, tmp_path: Path) -> None:
     assert by_engine.values["T_L"] == pytest.approx(T_L, abs=0.02)  # SUMO's is an implicit step of 0.02 s
     assert by_engine.values["saturation.accel_max_mps2"] == pytest.approx(DRIVE, rel=0.02)
     at_once = check_simulator(SumoCar(tmp_path, types, dt=0.02), step_s=0.02)
-    assert at_once.values["T_L"] < 0.02
+    assert at_once.values["T_L"] <= 0.02  # the least that is tried
     assert at_once.values["saturation.accel_max_mps2"] == pytest.approx(DRIVE, rel=0.02)
     assert at_once.values["saturation.accel_min_mps2"] == pytest.approx(-BRAKE, rel=0.02)
     for found in (by_engine, at_once):
@@ -112,4 +112,5 @@ def test_the_time_between_decisions_delays_by_up_to_half_of_it(action_s: float, 
     late = float(values["T_L"]) + float(values.get("dead_time.delay_s", 0.0))
     most = (action_s - 0.1) / 2
     assert most / 2 <= late < most + 0.05  # half a step of the log
-    assert ("dead_time" in found.verdict.names) == (action_s > 0.1)
+    # a wish that is held for half a second is no dead time all the same: it leaves a tone of its own
+    assert ("dead_time" in found.verdict.alias_set) == (action_s > 0.1)
