@@ -182,7 +182,7 @@ def worked_off(cluster: Cluster, tasks: Sequence[Task]) -> Iterator[tuple[Task, 
             if done.status == "finished":
                 yield task, result
             elif done.status != "error":
-                raise InputError("scheduler: the connection was lost; what was done is kept")
+                raise _without_workers(cluster)
             elif type(fault := future.exception()).__name__ != "KilledWorker":
                 yield task, _crashed(printable(f"{type(fault).__name__}: {fault}", 400))
             elif not alone:
@@ -207,11 +207,17 @@ def _next(futures: Any, cluster: Cluster) -> tuple[Any, Any]:
         if not cluster.local or cluster.client.scheduler_info()["workers"]:
             seen = now
         elif now - seen > NO_WORKER_S:
-            raise InputError(
-                f"memory: no worker has come back for {NO_WORKER_S:.0f} s within {cluster.limit}, needs more, such as "
-                "2GiB; what was done is kept"
-            )
+            raise _without_workers(cluster)
     return next(futures)
+
+
+def _without_workers(cluster: Cluster) -> InputError:
+    """Nobody computes any more: a local cluster's processes need more memory, another one cannot be reached."""
+    if not cluster.local:
+        return InputError("scheduler: the connection was lost; what was done is kept")
+    return InputError(
+        f"memory: no worker lives within {cluster.limit}, needs more, such as 2GiB; what was done is kept"
+    )
 
 
 def _order(task: Task) -> int:

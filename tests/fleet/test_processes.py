@@ -121,7 +121,7 @@ def test_a_log_that_ends_every_worker_becomes_a_row_and_the_others_are_done(tmp_
 def test_memory_in_which_no_worker_lives_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("avtorch.fleet.task.NO_WORKER_S", 5.0)
     write_fleet(tmp_path / "logs", {"car": 0.3})
-    with pytest.raises(InputError, match=r"^memory: no worker has come back for 5 s within 60MiB, needs more"):
+    with pytest.raises(InputError, match=r"^memory: no worker lives within 60MiB, needs more"):
         run_fleet(tmp_path / "logs", tmp_path / "out", settings=QUICK, workers=1, memory="60MiB")
 
 
