@@ -52,9 +52,10 @@ def test_a_single_cause_is_the_whole_budget(effect: Effect, key: str, within: fl
     (part,) = budget.parts
     assert part.name == effect.name
     assert part.parameters[key].mean == pytest.approx(getattr(effect, key), abs=within)
-    assert (
-        part.share.q95 > 0.85
-    )  # beside a delay, whose gap is a sixth of the noise, a free form takes some in one of 13
+    # a gap of a sixth of the noise: in one drive of 13 the plant's free form takes a part of it
+    carried = budget.unexplained.carried
+    assert part.share.mean > 0.5
+    assert part.share.mean + (0.0 if carried is None else carried.mean) > 0.85
     assert part.onset_s is None
     sums_to_one(budget)
 
