@@ -16,7 +16,7 @@ from avtorch.errors import InputError
 from avtorch.gap import ConstantResistance, DeadTime, Effect, SensorBias, plant
 from avtorch.gap.engine.coordinates import EFFECTS
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.joint import JointModel, block_scores, of_car, of_effect
+from avtorch.gap.engine.joint import JointModel, block_scores, of_car, of_effect, of_growth
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.quantity import Quantity
@@ -26,6 +26,7 @@ from avtorch.gap.result.log_facts import LogFacts
 from avtorch.io import Log
 from avtorch.report import comparison_html
 from avtorch.report.comparison import comparison_tables
+from benchmarks.blindtest import DrivePlan, draw_car, simulate
 from tests.bars import LEVEL, student
 from tests.gap.cars import log_of
 
@@ -141,6 +142,18 @@ def test_both_sides_share_what_has_not_changed() -> None:
     same = model.at((gain,), np.append(model.start.x, 0.0))
     assert same.objective == pytest.approx(model.start.objective, abs=1.0)
     assert fit.objective < same.objective - 10
+
+
+def test_an_effect_of_both_sides_may_be_larger_on_one() -> None:
+    model = _model(*(log_of(seconds=60.0, seed=seed) for seed in (1, 2)))
+    both = of_effect(EFFECTS["dead_band"], ((0.1,),), "both")
+    fit = model.at((both,), np.append(model.start.x, 0.1))
+    (name,) = (c.name for c in both.coordinates)
+    assert [h[name] for h in fit.sides] == [0.1, 0.1]
+    more = of_growth(both, np.array([0.1]))
+    fit = model.at((both, more), np.append(fit.x, 0.05))
+    assert [h[name] for h in fit.sides] == pytest.approx([0.1, 0.15])
+    assert [h.effects.count("dead_band") for h in fit.sides] == [1, 1]
 
 
 def test_scores_of_blocks_add_up_to_the_gradient() -> None:
@@ -264,11 +277,32 @@ def test_two_laps_of_one_car_name_no_cause(one: str, two: str, data_dir: Path) -
     assert "No change is named" in comparison.why or "No cause is named" in comparison.why
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("before", "after"), [(0.2, 0.2), (0.25, 0.1)])
+def test_a_dead_band_of_both_drives_is_no_change_of_it(before: float, after: float) -> None:
+    """No name of both sides competed once: it was `hand_over` at 0.99 beside a dead band at 0.93."""
+    car = draw_car(np.random.default_rng([11, 1]))
+    logs = []
+    for number, width in enumerate((before, after)):
+        plan = DrivePlan("following", 120.0, 50, 11002 + number)
+        effects = {"dead_band": {"half_width_mps2": width}}
+        run = simulate(car, plan.pilot(), seconds=120.0, rate_hz=50, effects=effects, seed=plan.seed)
+        logs.append(Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed))
+    cause = avtorch.compare(*logs).cause
+    assert cause is not None
+    if before == after:
+        assert cause.names == ()
+    else:
+        assert cause.names == ("dead_band",)
+        size = cause.parts[0].parameters["half_width_mps2"]
+        assert size.q05 < after - before < size.q95
+
+
 def test_a_limit_out_of_reach_is_not_reported() -> None:
     h = base_fit(DriveData.of(log_of([])))
     h.effects.append("saturation")
     h["drive_limit"], h["brake_limit"] = 4e-9, 0.6
-    assert list(_of_effect(h, of_effect(EFFECTS["saturation"], (), less=False))) == ["accel_min_mps2"]
+    assert list(_of_effect(h, of_effect(EFFECTS["saturation"], (), "after"))) == ["accel_min_mps2"]
 
 
 def test_a_side_has_its_own_rows_of_all_that_has_rows() -> None:

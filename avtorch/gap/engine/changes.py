@@ -22,11 +22,13 @@ from avtorch.gap.engine.joint import (
     Change,
     JointFit,
     JointModel,
+    Side,
     gram,
     nats_of,
     noise_left,
     of_car,
     of_effect,
+    of_growth,
     products,
 )
 from avtorch.gap.engine.likelihood import log_sum
@@ -34,9 +36,10 @@ from avtorch.gap.engine.priors import EFFECT_NATS, TEMPER, UNKNOWN_NATS
 from avtorch.gap.engine.shape_error import effect_energy, relative_size, shape_log_odds
 
 Progress = Callable[[str, int, int], None]
+Key = tuple[str, Side]
 
 MOST = 3
-"""Changes at once."""
+"""Changes at once, and as many effects that both sides share."""
 _FITTED = 6  # effects besides lag, gain and dead time
 _STARTS = 2  # of an effect
 _HELD = 0.9  # probability that an alias set holds
@@ -85,9 +88,9 @@ class ChangePosterior:
 
     model: JointModel
     best: Visited
-    visited: Mapping[frozenset[tuple[str, bool]], Visited]
+    visited: Mapping[frozenset[Key], Visited]
     scatter: Mapping[Change, Scatter]
-    siblings: Mapping[tuple[str, bool], tuple[str, ...]]
+    siblings: Mapping[Key, tuple[str, ...]]
     rejected: tuple[JointFit, Scatter, float] | None
     unknown: float
 
@@ -95,7 +98,11 @@ class ChangePosterior:
         """Of a change, over all visited sets."""
         return self._share(lambda key: change.key in key)
 
-    def _share(self, holds: Callable[[frozenset[tuple[str, bool]]], bool]) -> float:
+    def probability_of_any(self, names: Collection[str]) -> float:
+        """That something differs which has one of these names."""
+        return self._share(lambda key: any(name in names and side != "both" for name, side in key))
+
+    def _share(self, holds: Callable[[frozenset[Key]], bool]) -> float:
         whole = log_sum([v.log_weight for v in self.visited.values()])
         own = [v.log_weight for key, v in self.visited.items() if holds(key)]
         return math.exp(log_sum(own) - whole) if own else 0.0
@@ -115,21 +122,27 @@ def candidates(model: JointModel, effects: Collection[str]) -> list[Change]:
         if e.name == "low_speed_creep" and (data.smooth_speed < _CREEPS_BELOW).mean() < 0.01:
             continue
         starts = e.starts or _limits(model)
-        out.append(of_effect(e, starts, less=False))
+        out += [of_effect(e, starts, "after"), of_effect(e, starts, "both")]
         if e.one_sided:
-            out.append(of_effect(e, starts, less=True))
+            out.append(of_effect(e, starts, "before"))
     return out
 
 
 def search_changes(model: JointModel, changes: list[Change], progress: Progress | None = None) -> ChangePosterior:
     """The posterior over sets of `changes`."""
     now = Visited(model.start, 0.0)
-    visited = {frozenset[tuple[str, bool]](): now}
-    siblings: dict[tuple[str, bool], tuple[str, ...]] = {}
+    visited = {frozenset[Key](): now}
+    siblings: dict[Key, tuple[str, ...]] = {}
     rejected = None
-    for number in range(1, MOST + 1):
+    while len(_true(now.fit)) < MOST and len(now.fit.changes) < 2 * MOST:
+        number = len(now.fit.changes) + 1
         tried = []
         wanted = _promising(model, now.fit, [c for c in changes if c.name not in now.fit.names])
+        wanted += [
+            of_growth(c, now.fit.x[now.fit.at(c)])
+            for c in now.fit.changes
+            if now.fit.names.count(c.name) == 1 and c.shared
+        ]
         for done, change in enumerate(wanted):
             if progress is not None:
                 progress(f"change {number}: {change.name}", done, len(wanted))
@@ -145,11 +158,14 @@ def search_changes(model: JointModel, changes: list[Change], progress: Progress 
         chosen = _alike(each)
         now = visited[_key(now.fit)] = _with_wrong_shape(model, now, best)
         if best.log_weight < now.log_weight:
-            rejected = found, scatter, found.evidence - now.fit.evidence - EFFECT_NATS
+            if not found.changes[-1].shared:
+                rejected = found, scatter, found.evidence - now.fit.evidence - EFFECT_NATS
             break
         siblings[best.fit.changes[-1].key] = chosen
         now = best
         for change in now.fit.changes[:-1]:
+            if now.fit.names.count(change.name) > 1:
+                continue  # what grows is there
             rest = model.without(now.fit, change)
             other = Visited(rest, now.log_weight + scatter.temper * (rest.evidence - now.fit.evidence + EFFECT_NATS))
             if _key(rest) not in visited:
@@ -183,8 +199,13 @@ def lag_or_dead_time(model: JointModel) -> tuple[JointFit, float, float]:
 
 
 # inside ---------------------------------------------------------------------------------------------------------------
-def _key(fit: JointFit) -> frozenset[tuple[str, bool]]:
+def _key(fit: JointFit) -> frozenset[Key]:
     return frozenset(c.key for c in fit.changes)
+
+
+def _true(fit: JointFit) -> list[Change]:
+    """What differs, without what both sides share."""
+    return [c for c in fit.changes if not c.shared]
 
 
 def _weight(now: Visited, fit: JointFit, temper: float) -> float:
@@ -206,6 +227,7 @@ def _with_wrong_shape(model: JointModel, now: Visited, best: Visited) -> Visited
 
 def _alike(each: list[Visited]) -> tuple[str, ...]:
     """Names that hold nine tenths of the probability of what was tried, the most probable first."""
+    each = [v for v in each if not v.fit.changes[-1].shared]
     whole, held = log_sum([v.log_weight for v in each]), 0.0
     names: list[str] = []
     for v in sorted(each, key=lambda v: -v.log_weight):
@@ -225,35 +247,33 @@ def _limits(model: JointModel) -> tuple[tuple[float, float], ...]:
 
 def _promising(model: JointModel, fit: JointFit, changes: list[Change]) -> list[Change]:
     """Those of the car, and the effects that promise most to first order, with their best starts."""
-    found: list[tuple[float, Change, tuple[float, ...]]] = []
+    own = [(c, s) for c in changes if c.effect for s in c.starts]
+    crossed = np.zeros((len(fit.information), len(own)))
+    gains, sizes = np.zeros(len(own)), np.zeros(len(own))
     for after in (False, True):
-        own = [(c, s) for c in changes if c.effect and c.less != after for s in c.starts]
-        if not own:
+        at = [k for k, (change, _) in enumerate(own) if change.acts(after)]
+        if not at:
             continue
         h, noise = fit.sides[after], fit.noise[after]
         signals = []
-        for change, start in own:
+        for change, start in (own[k] for k in at):
             both = (*fit.changes, change)
-            x = np.concatenate([fit.x, start])
-            moved = model.hypothesis(both, model.coordinates(both), x, after)
+            moved = model.hypothesis(both, model.coordinates(both), np.concatenate([fit.x, start]), after)
             signals.append(moved.response() - h.predicted)
         tried = np.array(signals)
         base = np.concatenate([fit.derivatives[after], model.columns[after]])
-        shared = gram(noise, products(h.data, base, tried))
-        gains = gram(noise, products(h.data, model.left(fit, h)[None], tried))[0]
-        sizes = np.array([gram(noise, products(h.data, x[None], x[None]))[0, 0] for x in tried])
-        sizes = sizes - np.einsum("ij,ij->j", shared, np.linalg.solve(fit.information, shared))
-        for (change, start), gain, size in zip(own, gains, np.maximum(sizes, 0.0), strict=True):
-            if gain <= 0 and EFFECTS[change.effect].one_sided:
-                continue
-            if len(start) == 1:
-                scale = float(np.clip(abs(gain) / (size + 1e-9), 0.2, 4.0)) * math.copysign(1, gain)
-                start = (start[0] * scale,)
-            found.append((0.5 * float(gain) ** 2 / (float(size) + 1), change, start))
-    found.sort(key=lambda x: -x[0])
+        crossed[:, at] += gram(noise, products(h.data, base, tried))
+        gains[at] += gram(noise, products(h.data, model.left(fit, h)[None], tried))[0]
+        sizes[at] += [gram(noise, products(h.data, x[None], x[None]))[0, 0] for x in tried]
+    sizes = np.maximum(sizes - np.einsum("ij,ij->j", crossed, np.linalg.solve(fit.information, crossed)), 0.0)
     starts: dict[Change, list[tuple[float, ...]]] = {}
-    for _, change, start in found:
-        if len(starts) < _FITTED or change in starts:
+    for k in np.argsort(-0.5 * gains**2 / (sizes + 1)):
+        change, start = own[k]
+        if gains[k] <= 0 and EFFECTS[change.effect].one_sided:
+            continue
+        if len(start) == 1:
+            start = (start[0] * float(np.clip(abs(gains[k]) / (sizes[k] + 1e-9), 0.2, 4.0)) * float(np.sign(gains[k])),)
+        if change in starts or sum(c.shared == change.shared for c in starts) < _FITTED:
             starts.setdefault(change, []).append(start)
     best = [replace(c, starts=tuple(s[:_STARTS])) for c, s in starts.items()]
     return [c for c in changes if not c.effect] + best

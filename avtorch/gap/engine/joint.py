@@ -37,6 +37,7 @@ from avtorch.gap.engine.recorder import aligned, base_fit
 from avtorch.gap.simulator.plant import GapPlant
 
 Link = Literal["value", "log", "plus", "times"]
+Side = Literal["before", "after", "both"]
 
 _CAR = ("T_L", "K_L", "dead_time")
 _SCALES = {"T_L": COORDINATES["log_brake_lag"], "K_L": COORDINATES["gain_step"], "dead_time": COORDINATES["dead_time"]}
@@ -97,13 +98,17 @@ class JointCoordinate:
         """The coordinate whose prior on sizes it has; None: a nuisance."""
         if not self.change:
             return None
-        c = _SCALES[self.name] if self.link in ("times", "plus") else COORDINATES[self.name]
+        c = self._scale if self.link in ("times", "plus") else COORDINATES[self.name]
         return c if c.mean is None else None
+
+    @property
+    def _scale(self) -> Coordinate:
+        return _SCALES.get(self.name) or COORDINATES[self.name]
 
     def prior(self, neutral: float) -> tuple[float, float]:
         """Mean and standard deviation of the normal prior under which it is fitted."""
         if self.link in ("times", "plus"):
-            return 0.0, 4 * _SCALES[self.name].scale
+            return 0.0, 4 * self._scale.scale
         if self.link == "log":
             return (math.log(0.3), 1.5) if self.name == "T_L" else (0.0, 0.5)
         return normal_prior(self.name, neutral)
@@ -111,17 +116,27 @@ class JointCoordinate:
 
 @dataclass(frozen=True)
 class Change:
-    """One thing that differs: T_L, K_L, the dead time, or an effect on the side after (`less`: before)."""
+    """One thing that differs: T_L, K_L, the dead time, or an effect on the side after (`less`: before).
+
+    `shared`: an effect on both sides, which is no change, but what an effect on one side would be taken for; `grows`:
+    such an effect has other parameters on the side after.
+    """
 
     name: str
     coordinates: tuple[JointCoordinate, ...] = field(repr=False)
     starts: tuple[tuple[float, ...], ...] = field(repr=False)
     effect: str = ""
     less: bool = False
+    shared: bool = False
+    grows: bool = False
 
     @property
-    def key(self) -> tuple[str, bool]:
-        return self.name, self.less
+    def key(self) -> tuple[str, Side]:
+        return self.name, "both" if self.shared else "before" if self.less else "after"
+
+    def acts(self, after: bool) -> bool:
+        """Whether it is an effect of that side."""
+        return bool(self.effect) and not self.grows and (self.shared or self.less != after)
 
 
 def of_car(name: str) -> Change:
@@ -130,11 +145,17 @@ def of_car(name: str) -> Change:
     return Change(name, (JointCoordinate(name, link, before=False, change=name),), tuple((x,) for x in _STARTS[name]))
 
 
-def of_effect(effect: EngineEffect, starts: Sequence[tuple[float, ...]], less: bool) -> Change:
-    """An effect on one side alone."""
-    side = {"before": less, "after": not less}
-    own = tuple(JointCoordinate(c.name, "value", **side, change=effect.base) for c in effect.coordinates)
-    return Change(effect.base, own, tuple(starts), effect.name, less)
+def of_effect(effect: EngineEffect, starts: Sequence[tuple[float, ...]], on: Side) -> Change:
+    """An effect on one side alone, or on both."""
+    sides = {"before": on != "after", "after": on != "before"}
+    own = tuple(JointCoordinate(c.name, "value", **sides, change=effect.base) for c in effect.coordinates)
+    return Change(effect.base, own, tuple(starts), effect.name, less=on == "before", shared=on == "both")
+
+
+def of_growth(shared: Change, x: FloatArray) -> Change:
+    """Other parameters on the side after, of an effect on both whose coordinates are `x`."""
+    own = tuple(JointCoordinate(c.name, "plus", before=False, change=shared.name) for c in shared.coordinates)
+    return Change(shared.name, own, (tuple(0.5 * x), tuple(-0.5 * x)), shared.effect, grows=True)
 
 
 @dataclass(eq=False)
@@ -287,7 +308,7 @@ class JointModel:
     ) -> Hypothesis:
         """One side's hypothesis at `x` (coordinate,)."""
         h = replace_data(self.base, self.sides[after])
-        h.effects += [change.effect for change in changes if change.effect and change.less != after]
+        h.effects += [change.effect for change in changes if change.acts(after)]
         for c, value in zip(coordinates, x, strict=True):
             if not (c.after if after else c.before):
                 continue

@@ -45,8 +45,8 @@ def cause_of_change(
     """
     names = [adopt(k).name for k in kinds if not (k.random or k.of_the_drive)]
     found = search_changes(model, candidates(model, names), progress)
-    parts = tuple(_part(found, change) for change in found.best.fit.changes)
-    parts = tuple(part for part in parts if part.probability >= LIKELY or len(part.alias_set) > 1)
+    parts = tuple(_part(found, change) for change in found.best.fit.changes if not change.shared)
+    parts = tuple(part for part in parts if found.probability_of_any(part.alias_set) >= LIKELY)
     detectable = _detectable(model)
     answer: Answer = "named"
     if not parts:
@@ -119,6 +119,10 @@ def _reported(model: JointModel, fit: JointFit, change: Change, x: FloatArray) -
         unit = {"T_L": "_s", "dead_time": "_s"}.get(change.name, "")
         a, b = before[change.name], after[change.name]
         return {f"before{unit}": a, f"after{unit}": b, f"change{unit}": b - a}
+    if change.grows:
+        old, new = _of_effect(before, change), _of_effect(after, change)
+        neutral = {q.name for q in table_effect(after, change.effect).coordinates() if q.neutral == 0.0}
+        return {key: value - old[key] if key in neutral else value for key, value in new.items() if key in old}
     return _of_effect(before if change.less else after, change)
 
 
