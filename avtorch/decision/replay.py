@@ -7,7 +7,7 @@ rate. From it the strategist predicts clipping and cost before it acts on the ca
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -94,13 +94,9 @@ class Prediction:
     command_rms_mps2: Tensor
     amplification: Tensor
 
-    def map(self, change: object) -> Prediction:
+    def map(self, change: Callable[[Tensor], Tensor]) -> Prediction:
         """Apply a function of a tensor to every field."""
-        return Prediction(**{name: change(value) for name, value in vars(self).items()})  # type: ignore[operator]
-
-    def as_dict(self, scenario: int = 0) -> dict[str, float]:
-        """One scenario's figures, for a prediction of shape (scenario,)."""
-        return {name: float(value[scenario]) for name, value in vars(self).items()}
+        return Prediction(**{name: change(value) for name, value in vars(self).items()})
 
 
 @torch.no_grad()

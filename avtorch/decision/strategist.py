@@ -22,7 +22,6 @@ Among equals intrusiveness is weighed against clipping. The decision's `sufficie
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -47,38 +46,21 @@ _SCREEN = 12
 class Decision:
     """The decision for each scenario; every tensor (scenario,).
 
-    `setting`: the choice. `sufficient`: whether it meets both conditions; `p_string_stable` under the belief, and
-    `p_robust` with the spread doubled. `intrusiveness` as in `grid.py`. `predicted`: clipping and costs in the replay.
-    `strategies` lead from the default to the choice; `changes`: it differs from the setting in force. `why`: one
-    sentence each. `interim`: the setting until the driver has set the longer time gap, `p_interim` its P(string
-    stable), `driver_delay_s` the time allowed for it; where no driver is asked, 0 and the choice itself.
+    `setting`: the choice. `sufficient`: whether it meets both conditions; `p_string_stable` under the belief.
+    `intrusiveness` as in `grid.py`. `predicted`: clipping and costs in the replay. `strategies` lead from the default
+    to the choice; `changes`: it differs from the setting in force. `driver_delay_s`: the time that the driver is
+    allowed to set a longer time gap, 0 where none is asked. `why`: one sentence each.
     """
 
     setting: Setting
     sufficient: Tensor
     p_string_stable: Tensor
-    p_robust: Tensor
     intrusiveness: Tensor
     predicted: Prediction
     strategies: list[set[int]]
     changes: Tensor
-    why: list[str]
-    interim: Setting
-    p_interim: Tensor
     driver_delay_s: Tensor
-
-    def as_dict(self, scenario: int = 0) -> dict[str, Any]:
-        """One scenario as an action of `run.json` (without its time), costs beside it."""
-        asked = float(self.driver_delay_s[scenario])
-        return {
-            "strategies": sorted(self.strategies[scenario]),
-            "settings": self.setting.as_dict(scenario),
-            "why": self.why[scenario],
-            "p_string_stable": float(self.p_string_stable[scenario]),
-            "sufficient": bool(self.sufficient[scenario]),
-            "predicted": self.predicted.as_dict(scenario),
-            "driver_delay_s": asked,
-        }
+    why: list[str]
 
 
 @dataclass(frozen=True)
@@ -155,131 +137,87 @@ class Strategist:
             )
         T_L, K_L = T_L.to(torch.float64), K_L.to(torch.float64)
         wrong = torch.ones(scenarios, dtype=torch.bool) if model_wrong is None else model_wrong
+        mean = (T_L.mean(dim=-1), K_L.mean(dim=-1))
+        every = max(1, T_L.shape[1] // self.draws)
         search = _Search(
             self,
-            T_L,
-            K_L,
+            self.grid.candidates(*mean, current=current, default=default, model_wrong=wrong),
             history,
-            current=current,
-            default=default,
+            belief=(T_L[:, ::every], K_L[:, ::every]),
+            mean=mean,
             time_gap_now=current.time_gap if time_gap_now is None else time_gap_now,
-            wrong=wrong,
             limits=(torch.as_tensor(accel_min).expand(scenarios), torch.as_tensor(accel_max).expand(scenarios)),
         )
         pick, sufficient = search.run()
         rows = torch.arange(scenarios)
         chosen = search.candidates.setting[rows, pick]
-        p = self.probability(chosen, T_L, K_L)
-        deaf = p if not bool(chosen.feedforward.any()) else self.probability(chosen.replace(feedforward=0.0), T_L, K_L)
-        longer = chosen.time_gap > current.time_gap + 1e-9
-        asked = longer & (self.driver_delay > 0.0)
-        interim = chosen.replace(time_gap=torch.where(asked, current.time_gap, chosen.time_gap))
         predicted = search.prediction(pick)
+        p = self.probability(chosen, T_L, K_L)
+        p_deaf = p
+        if bool(chosen.feedforward.any()):
+            p_deaf = self.probability(chosen.replace(feedforward=0.0), T_L, K_L)
+        asked = (chosen.time_gap > current.time_gap + 1e-9) & (self.driver_delay > 0.0)
         # Gains that follow from the gap are no strategy of their own.
         follow = self.grid.gains_of_gap is not None
         strategies = chosen.strategies(default.replace(gains=chosen.gains) if follow else default)
-        return Decision(
-            setting=chosen,
-            sufficient=sufficient,
-            p_string_stable=p,
-            p_robust=self.probability(chosen, *_widened(T_L, K_L)),
-            intrusiveness=search.candidates.cost[rows, pick],
-            predicted=predicted,
-            strategies=strategies,
-            changes=chosen.differs(current),
-            why=self._reasons(
-                chosen,
-                current=current,
-                default=default,
-                strategies=strategies,
-                sufficient=sufficient,
-                p_string_stable=p,
-                p_deaf=deaf,
-                predicted=predicted,
-                asked=asked,
-                seconds=history.seconds,
-            ),
-            interim=interim,
-            p_interim=self.probability(interim, T_L, K_L),
-            driver_delay_s=asked * self.driver_delay,
-        )
-
-    def _reasons(
-        self,
-        chosen: Setting,
-        *,
-        current: Setting,
-        default: Setting,
-        strategies: list[set[int]],
-        sufficient: Tensor,
-        p_string_stable: Tensor,
-        p_deaf: Tensor,
-        predicted: Prediction,
-        asked: Tensor,
-        seconds: float,
-    ) -> list[str]:
-        """Why a setting was chosen, in one plain sentence per scenario; tensors are (scenario,).
-
-        `p_deaf`: P(string stable) if the leader's acceleration is no longer received. `asked`: the driver is asked to
-        set the gap. `seconds` [s] of the past over which `predicted` was replayed.
-        """
-        out = []
+        why = []
         for i, used in enumerate(strategies):
-            now, was = chosen.as_dict(i), current.as_dict(i)
-            steps = []
-            if 1 in used:
-                steps.append(
-                    f"lower level models T {now['T_hat']:.2f} s, K {now['K_hat']:.2f} and targets {now['T_d']:.2f} s"
-                )
-            if 2 in used:
-                verb = "driver asked for a time gap of" if bool(asked[i]) else "time gap"
-                steps.append(f"{verb} {now['time_gap_s']:g} s instead of {float(default.time_gap[i]):g} s")
-            if 3 in used:
-                steps.append("gains " + ", ".join(f"{k:g}" for k in now["gains"]))
-            if 4 in used:
-                lost = f"P(string stable) {float(p_deaf[i]):.2f} if the link is lost"
-                steps.append(f"leader's acceleration fed forward with k_f {now['feedforward']:g} ({lost})")
-            what = "; ".join(steps) if steps else "default setting"
-            if now == was:
+            what = _steps(used, chosen[i : i + 1], default[i : i + 1], bool(asked[i]), float(p_deaf[i]))
+            if chosen.as_dict(i) == current.as_dict(i):
                 what = f"setting in force stays ({what})"
-            clipped = 100.0 * float(predicted.clipped_share[i])
-            past = f"{clipped:.1f} % of commands clipped in a replay of the past {seconds:.0f} s"
-            result = f"P(string stable) {float(p_string_stable[i]):.2f}, {past}"
+            clipped = f"{100.0 * float(predicted.clipped_share[i]):.1f} % of commands clipped"
+            past = f"{clipped} in a replay of the past {history.seconds:.0f} s"
+            result = f"P(string stable) {float(p[i]):.2f}, {past}"
             if bool(sufficient[i]):
-                out.append(f"least intrusive sufficient setting: {what} ({result})")
+                why.append(f"least intrusive sufficient setting: {what} ({result})")
             else:
-                least, most = f"{self.required:g}", f"{100 * self.most_clipped:g}"
-                missed = f"keeps P(string stable) at {least} with {most} % of commands clipped or less"
-                out.append(f"no setting of the grid {missed}; the best one: {what} ({result})")
-        return out
+                aim = f"at {self.required:g} with {100 * self.most_clipped:g} % of commands clipped or less"
+                why.append(f"no setting of the grid keeps P(string stable) {aim}; the best one: {what} ({result})")
+        cost, changes = search.candidates.cost[rows, pick], chosen.differs(current)
+        return Decision(chosen, sufficient, p, cost, predicted, strategies, changes, asked * self.driver_delay, why)
+
+
+def _steps(used: set[int], chosen: Setting, default: Setting, asked: bool, p_deaf: float) -> str:
+    """The steps of the strategies `used` from one scenario's default to its choice, in words.
+
+    `asked`: the driver is asked to set the gap. `p_deaf`: P(string stable) if the leader's acceleration is no longer
+    received.
+    """
+    now = chosen.as_dict()
+    steps = []
+    if 1 in used:
+        steps.append(f"lower level models T {now['T_hat']:.2f} s, K {now['K_hat']:.2f} and targets {now['T_d']:.2f} s")
+    if 2 in used:
+        verb = "driver asked for a time gap of" if asked else "time gap"
+        steps.append(f"{verb} {now['time_gap_s']:g} s instead of {float(default.time_gap[0]):g} s")
+    if 3 in used:
+        steps.append("gains " + ", ".join(f"{k:g}" for k in now["gains"]))
+    if 4 in used:
+        lost = f"P(string stable) {p_deaf:.2f} if the link is lost"
+        steps.append(f"leader's acceleration fed forward with k_f {now['feedforward']:g} ({lost})")
+    return "; ".join(steps) if steps else "default setting"
 
 
 class _Search:
-    """One decision's search over (scenario, candidate)."""
+    """One decision's search over (scenario, candidate); `belief` are the draws used, `mean` of all of them."""
 
     def __init__(
         self,
         rules: Strategist,
-        T_L: Tensor,
-        K_L: Tensor,
+        candidates: Candidates,
         history: History,
         *,
-        current: Setting,
-        default: Setting,
+        belief: tuple[Tensor, Tensor],
+        mean: tuple[Tensor, Tensor],
         time_gap_now: Tensor,
-        wrong: Tensor,
         limits: tuple[Tensor, Tensor],
     ) -> None:
-        self.rules, self.history, self.gap_now, self.limits = rules, history, time_gap_now, limits
-        self.T, self.K = T_L.mean(dim=-1), K_L.mean(dim=-1)
-        every = max(1, T_L.shape[1] // rules.draws)
-        self.belief = (T_L[:, ::every], K_L[:, ::every])
-        self.candidates: Candidates = rules.grid.candidates(
-            self.T, self.K, current=current, default=default, model_wrong=wrong
-        )
-        shape = self.candidates.cost.shape
+        self.rules, self.candidates, self.history, self.belief = rules, candidates, history, belief
+        self.gap_now, self.limits = time_gap_now, limits
+        self.T, self.K = mean
+        shape = candidates.cost.shape
         self.p = torch.full(shape, torch.nan, dtype=torch.float64)
-        self.total = self.candidates.cost.clone()
+        self.total = candidates.cost.clone()
         self.predictions: Prediction | None = None
         self.replayed = torch.zeros(shape, dtype=torch.bool)
 
