@@ -28,8 +28,9 @@ from torch import Tensor
 
 from avtorch.decision.grid import Candidates, Grid
 from avtorch.decision.replay import History, Prediction, replay
-from avtorch.decision.settings import Number, Setting
+from avtorch.decision.settings import Setting
 from avtorch.errors import InputError
+from avtorch.vehicle.arguments import Number
 from avtorch.vehicle.controllers import RAMP_RATE
 
 # Candidates evaluated, and replayed, at a time: with few scenarios a larger batch costs hardly more.

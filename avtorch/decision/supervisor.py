@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from avtorch.decision.monitor import Monitor
-from avtorch.decision.replay import History
+from avtorch.decision.replay import History, of_scenarios
 from avtorch.decision.settings import Setting
 from avtorch.decision.strategist import Strategist
 from avtorch.decision.watch import Action, Alert, SupervisedRun, Watch, WatchedWindow
@@ -214,13 +213,14 @@ class Supervisor:
             default=self.default[asked],
             time_gap_now=gap_now[asked],
             model_wrong=self._model_wrong[asked],
-            accel_min=_of(lower.accel_min, asked),
-            accel_max=_of(lower.accel_max, asked),
+            accel_min=of_scenarios(lower.accel_min, asked),
+            accel_max=of_scenarios(lower.accel_max, asked),
         )
         changed = decision.changes
         where = torch.zeros(loop.scenarios, dtype=torch.bool).index_put((asked,), changed)
         if bool(changed.any()):
-            self._order(_scatter(self._ordered, asked, decision.setting))
+            new = decision.setting
+            self._order(self._ordered.map(lambda name, old: old.index_put((asked,), getattr(new, name))))
         truth = _truth(loop)
         for j, i in enumerate(asked.tolist()):
             if not bool(changed[j]):
@@ -250,20 +250,15 @@ class Supervisor:
         self._acted |= where
 
     def _verdict(self, watched: WatchedWindow) -> Tensor:
-        """P(stable) (scenario,) of the decided setting, which may be in force only once the driver has set the time
-        gap."""
-        report = watched.report
-        p = torch.minimum(report.p_string_stable, report.p_local_stable)
+        """P(string stable) (scenario,) of the decided setting, which may be in force only once the driver has set the
+        time gap."""
         waiting = self._due < _NEVER
         if not bool(waiting.any()):
-            return p
+            return watched.report.p_string_stable
         T_L, K_L = (watched.window.belief.draws[..., i].mT for i in range(2))
         dead_time = self.watch.monitor.dead_time
-        soon = torch.minimum(
-            self._ordered.p_string_stable(T_L, K_L, dead_time=dead_time, link_delay=self.loop.link_delay),
-            self._ordered.p_locally_stable(T_L, K_L, dead_time=dead_time),
-        )
-        return torch.where(waiting, soon, p)
+        soon = self._ordered.p_string_stable(T_L, K_L, dead_time=dead_time, link_delay=self.loop.link_delay)
+        return torch.where(waiting, soon, watched.report.p_string_stable)
 
     def _order(self, setting: Setting) -> None:
         """Put `setting` in force, but for the longer time gaps that a driver is asked for."""
@@ -355,14 +350,3 @@ def _check_reach(strategist: Strategist, loop: ClosedLoop) -> None:
         )
     if loop.scenarios > 1:
         raise InputError(f"scenarios: found {loop.scenarios}, but this controller has one time gap for all of them")
-
-
-def _of(value: float | Tensor, index: Tensor) -> float | Tensor:
-    return value[index] if isinstance(value, Tensor) and value.dim() else value
-
-
-def _scatter(setting: Setting, index: Tensor, new: Setting) -> Setting:
-    """`setting` with the scenarios `index` replaced by `new`."""
-    return setting.replace(
-        **{f.name: getattr(setting, f.name).index_put((index,), getattr(new, f.name)) for f in fields(Setting)}
-    )
