@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from avtorch.decision.replay import History, of_scenarios
 from avtorch.decision.settings import Setting
 from avtorch.decision.strategist import Strategist
 from avtorch.decision.watch import Action, Alert, SupervisedRun, Watch, WatchedWindow
-from avtorch.display.progress import asks_for_bar, called, progress_bar
+from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.inference.form import JerkForm
 from avtorch.inference.latent import LatentForm
@@ -28,8 +28,6 @@ _NEVER = 2**62  # steps
 
 HISTORY_S = 20.0
 """Length that the strategist replays [s]: ten windows, long enough for one manoeuvre of the leader."""
-
-Strategy = Literal["auto", "1", "2", "3"]
 
 ALLOWED: dict[str, frozenset[int]] = {
     "auto": frozenset({1, 2, 3}),
@@ -98,7 +96,9 @@ class Supervisor:
             )
         if strategist is not None:
             _check_reach(strategist, loop)
-        self.setting = read_setting(loop) if setting is None else _for_scenarios(setting, n)
+        self.setting = read_setting(loop) if setting is None else setting.replace(scenarios=n)
+        if self.setting.shape != (n,):
+            raise InputError(f"setting: found shape {tuple(self.setting.shape)}, needs one or {n} scenarios")
         if monitor is None:
             dead_time = 0.0 if strategist is None else strategist.dead_time
             accepted = (self.setting.T_hat, self.setting.K_hat)
@@ -116,31 +116,20 @@ class Supervisor:
         self._recent: list[Block] = []
         self._unanswered: list[WatchedWindow] = []
 
+    @shows_progress
     def run(
         self,
         duration: float,
         *,
         events: Sequence[tuple[float, Callable[[ClosedLoop], None]]] = (),
-        progress: Callable[[float], None] | bool | None = None,
+        progress: Callable[[float, float], None] | bool | None = None,
     ) -> SupervisedRun:
         """Advance by `duration` [s]. `events` are `(time [s], change)`: `change(loop)` is called at that time.
 
-        `progress(seconds done)` is called after each window; or True, False, None, as in `avtorch.diagnose`. Raises
+        `progress(done, of)` [s] is called after each window; or True, False, None, as in `avtorch.diagnose`. Raises
         `InputError` for less than one step.
         """
-        if not asks_for_bar(progress):
-            return self._run(duration, events, called(progress))
-        begun = self.loop.time
-        with progress_bar("drive") as step:
-            return self._run(duration, events, lambda time: step(time - begun, duration))
-
-    def _run(
-        self,
-        duration: float,
-        events: Sequence[tuple[float, Callable[[ClosedLoop], None]]],
-        progress: Callable[[float], None] | None,
-    ) -> SupervisedRun:
-        loop, n = self.loop, self.loop.scenarios
+        step, loop, n, begun = called(progress), self.loop, self.loop.scenarios, self.loop.time
         if not 0.5 * loop.dt < duration < float("inf"):
             raise InputError(f"duration: found {duration:g} s, needs at least one step of {loop.dt:g} s")
         end = loop.steps_done + round(duration / loop.dt)
@@ -165,11 +154,13 @@ class Supervisor:
             self._remember(block)
             for watched in self._feed(block):
                 windows.append(watched)
-                self._note(watched, alerts)
+                for i in torch.nonzero(watched.report.any).squeeze(-1).tolist():
+                    for name in watched.report.names(i):
+                        alerts[i].append(Alert(watched.window.end_s, name, watched.report.why(name, i)))
                 # an alarm at the run's last step is acted on when the run continues
                 self._unanswered.append(watched)
-            if progress is not None:
-                progress(loop.time)
+            if step is not None:
+                step(loop.time - begun, duration)
         return SupervisedRun(Block.concatenate(blocks), windows, alerts, actions)
 
     def _feed(self, block: Block) -> list[WatchedWindow]:
@@ -177,12 +168,6 @@ class Supervisor:
         # a crashed car's rows mean nothing; standstill is not GLVD
         usable = (block.speed >= STANDSTILL_MPS) & ~self.loop.collided[:, None]
         return self.watch.feed(block.time, columns, self.setting, usable=usable, until=self.loop.time)
-
-    def _note(self, watched: WatchedWindow, alerts: list[list[Alert]]) -> None:
-        report = watched.report
-        for i in torch.nonzero(report.any).squeeze(-1).tolist():
-            for name in report.names(i):
-                alerts[i].append(Alert(watched.window.end_s, name, report.why(name, i)))
 
     def _remember(self, block: Block) -> None:
         """Keep only the rows that the strategist replays."""
@@ -320,14 +305,6 @@ def _time_gap_now(loop: ClosedLoop, setting: Setting) -> Tensor:
     """The time gap in force [s], (scenario,), on its way to the setting's."""
     at = getattr(loop.controller, "time_gap_at", None)
     return setting.time_gap if at is None else at(loop.time).expand(loop.scenarios)
-
-
-def _for_scenarios(setting: Setting, n: int) -> Setting:
-    """A given setting, (scenario,)."""
-    whole = setting.replace(scenarios=n)
-    if whole.shape != (n,):
-        raise InputError(f"setting: found shape {tuple(setting.shape)}, needs one or {n} scenarios")
-    return whole
 
 
 def _check_reach(strategist: Strategist, loop: ClosedLoop) -> None:
