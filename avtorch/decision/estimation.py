@@ -236,11 +236,11 @@ def estimate(
     signals = {name: torch.from_numpy(getattr(log, name)) for name in chosen.columns}
     signals["accel_cmd"] = torch.from_numpy(command)
     name = "jerk" if isinstance(chosen, JerkForm) else "latent"
-    settings = {"window": window, "form": name, "delay": dead_time, "estimator": estimator, "seed": seed}
-    settings |= {"accepted": accepted, "mode": inference.get("mode"), "align": align}
-    kept = KeptWindows(
-        checkpoint, {} if checkpoint is None else estimated_work(log, settings, watch.state_dict(), setting, inference)
-    )
+    work: dict[str, str] = {}
+    if checkpoint is not None:
+        settings = (window, name, dead_time, estimator, seed, accepted, align, inference)
+        work = estimated_work(log, settings, watch.state_dict(), setting)
+    kept = KeptWindows(checkpoint, work)
     windows, begin = kept.restored(watch, setting)
     tell = (lambda _: None) if finished is None else finished
     for w in windows:

@@ -3,7 +3,7 @@
 Each window's posterior is the prior of the next, so the file holds the whole state behind the last row taken in: the
 belief with its draws, the state of the random numbers, the open window's rows and the monitor's baseline. With it the
 windows that follow are those of an uninterrupted run, to the bit. Of the windows before it only what an answer holds is
-kept, without their draws. The file states what it belongs to: the content of the log, the settings and the version.
+kept, without their draws. The file states what it belongs to.
 """
 
 from __future__ import annotations
@@ -50,25 +50,20 @@ class Place:
     ahead: float = 0.0
 
 
-def estimated_work(log: Log, settings: Mapping[str, Any], *more: Any) -> dict[str, Any]:
-    """What finished windows belong to, as JSON; `settings` are told apart by name, `more` by fingerprint."""
+def estimated_work(log: Log, *settings: Any) -> dict[str, str]:
+    """What finished windows belong to, by fingerprint."""
     content = fingerprint([getattr(log, name) for name in _SIGNALS])
-    return {
-        "avtorch": __version__,
-        "log": {"name": log.name, "rows": log.rows, "sha256": content},
-        "settings": {name: str(value) for name, value in settings.items()},
-        "sha256": fingerprint(settings, more),
-    }
+    return {"avtorch": __version__, "log": content, "settings": fingerprint(settings)}
 
 
 class KeptWindows:
     """The windows of one run of `estimate` at `path`; with None nothing is kept.
 
     `work`: what they belong to, from `estimated_work`. Raises `InputError` for a file that is damaged or belongs to
-    other work, and states the difference.
+    other work.
     """
 
-    def __init__(self, path: str | os.PathLike[str] | None, work: Mapping[str, Any]) -> None:
+    def __init__(self, path: str | os.PathLike[str] | None, work: Mapping[str, str]) -> None:
         self.path, self.work = None if path is None else Path(path), dict(work)
         self._written = time.monotonic()
         self._state: dict[str, Any] | None = None
@@ -79,8 +74,9 @@ class KeptWindows:
         if self.path is None or not os.path.lexists(self.path):
             return [], Place()
         found = read_sealed_bytes(self.path, schema=SCHEMA, most=MOST, remedy=REMEDY)
-        if other := _difference(found.of, self.work):
-            raise InputError(f"{self.path}: was begun with {other}; needs the same log and settings, or {REMEDY}")
+        if other := [name for name, value in self.work.items() if found.of.get(name) != value]:
+            differs = f"was begun with different {' and '.join(other)}"
+            raise InputError(f"{self.path}: {differs}; needs the same log and settings, or {REMEDY}")
         state = unpacked(found.content, self.path, REMEDY)
         try:
             watch.load_state_dict(state["watch"])
@@ -142,17 +138,3 @@ def _window(entry: Mapping[str, Any], setting: Setting) -> WatchedWindow:
         (numbers(entry["accepted"][0]), numbers(entry["accepted"][1])),
     )
     return WatchedWindow(Window(entry["start_s"], entry["end_s"], numbers(entry["n"]), belief), report, setting)
-
-
-def _difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
-    """The differences in words; None if there are none."""
-    if set(before) != set(now) or not all(isinstance(before[name], dict) for name in ("log", "settings")):
-        return "other kinds of settings"
-    if before["avtorch"] != now["avtorch"]:
-        return f"avtorch {str(before['avtorch'])[:40]}, not {now['avtorch']}"
-    if before["log"].get("sha256") != now["log"]["sha256"]:
-        return f"another log ({str(before['log'].get('name'))[:80]}, {str(before['log'].get('rows'))[:20]} rows)"
-    for name, value in now["settings"].items():
-        if before["settings"].get(name) != value:
-            return f"{name} {str(before['settings'].get(name))[:40]}"
-    return "other settings" if before["sha256"] != now["sha256"] else None

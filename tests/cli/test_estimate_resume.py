@@ -110,22 +110,22 @@ def test_a_killed_run_goes_on_from_what_was_written_last(tmp_path: Path, monkeyp
 
 
 @pytest.mark.parametrize(
-    ("more", "words"),
+    "more",
     [
-        (["--seed", "1"], "seed 0"),
-        pytest.param(["--window", "1"], "window 2.0", marks=pytest.mark.slow),
-        pytest.param(["--tau", "1.2"], "other settings", marks=pytest.mark.slow),
+        ["--seed", "1"],
+        pytest.param(["--window", "1"], marks=pytest.mark.slow),
+        pytest.param(["--tau", "1.2"], marks=pytest.mark.slow),
     ],
 )
 def test_other_settings_are_refused_in_one_line(
-    interrupted: tuple[list[str], Path], capsys: pytest.CaptureFixture[str], more: list[str], words: str
+    interrupted: tuple[list[str], Path], capsys: pytest.CaptureFixture[str], more: list[str]
 ) -> None:
     line, out = interrupted
     capsys.readouterr()
     assert main([*line, *more, "--out", str(out)]) == 2
     told = capsys.readouterr().err
     assert told.count("\n") == 1
-    assert f"{out / WINDOWS}: was begun with {words}; needs the same log and settings" in told
+    assert f"{out / WINDOWS}: was begun with different settings; needs the same log and settings" in told
     assert "avtorch estimate --no-resume" in told
     assert main([*line, *more, "--no-resume", "--out", str(out)]) == 0
 
@@ -137,7 +137,7 @@ def test_another_log_of_the_same_name_is_refused(
     path = Path(line[1])
     path.write_text(path.read_text(encoding="utf-8").replace("15.0", "15.1", 1), encoding="utf-8")
     assert main([*line, "--out", str(out)]) == 2
-    assert "was begun with another log (" in capsys.readouterr().err
+    assert "was begun with different log;" in capsys.readouterr().err
 
 
 def test_a_damaged_file_is_refused(interrupted: tuple[list[str], Path], capsys: pytest.CaptureFixture[str]) -> None:
