@@ -9,7 +9,7 @@ A setting is *sufficient* when
    without this condition, inverting a slow actuator would always win on paper.
 
 Among the sufficient settings the strategist takes the one of least `total`: the intrusiveness of `grid.py` plus
-`margin` times the probability of string instability when the spread of the belief is doubled. The doubling accounts for
+`MARGIN` times the probability of string instability when the spread of the belief is doubled. The doubling accounts for
 the prior, which pulls the first posterior after a change towards the past. Settings are searched in order of
 intrusiveness, and the search ends when no remaining one could be better. Where no setting is sufficient, every setting
 that reaches `required` has been replayed; the strategist then takes the best P(string stable) among those that clip at
@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from avtorch.decision.grid import Candidates, Grid
+from avtorch.decision.grid import MARGIN, Candidates, Grid
 from avtorch.decision.replay import History, Prediction, replay
 from avtorch.decision.settings import Setting
 from avtorch.errors import InputError
@@ -303,7 +303,7 @@ class _Search:
         left = self.p[r, c] >= self.rules.required
         r, c = r[left], c[left]
         unstable = 1.0 - self._probability(r, c, _widened(*self.belief), every=2)
-        self.total[r, c] += self.rules.grid.intrusiveness.margin * unstable
+        self.total[r, c] += MARGIN * unstable
 
     def _probability(self, r: Tensor, c: Tensor, belief: tuple[Tensor, Tensor], *, every: int = 1) -> Tensor:
         """P(string stable) of the pairs (scenario r, candidate c), from every n-th draw."""

@@ -12,7 +12,7 @@ from avtorch.decision.monitor import Monitor
 from avtorch.decision.replay import History, of_scenarios
 from avtorch.decision.settings import Setting
 from avtorch.decision.strategist import Strategist
-from avtorch.decision.watch import Action, Alert, SupervisedRun, Watch, WatchedWindow
+from avtorch.decision.watch import Action, SupervisedRun, Watch, WatchedWindow
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.inference.form import JerkForm
@@ -136,7 +136,6 @@ class Supervisor:
         pending = sorted(((round(t / loop.dt), change) for t, change in events), key=lambda event: event[0])
         blocks: list[Block] = []
         windows: list[WatchedWindow] = []
-        alerts: list[list[Alert]] = [[] for _ in range(n)]
         actions: list[list[Action]] = [[] for _ in range(n)]
         while loop.steps_done < end:
             for watched in self._unanswered:
@@ -152,16 +151,12 @@ class Supervisor:
             block = loop.advance(until - loop.steps_done)
             blocks.append(block)
             self._remember(block)
-            for watched in self._feed(block):
-                windows.append(watched)
-                for i in torch.nonzero(watched.report.any).squeeze(-1).tolist():
-                    for name in watched.report.names(i):
-                        alerts[i].append(Alert(watched.window.end_s, name, watched.report.why(name, i)))
-                # an alarm at the run's last step is acted on when the run continues
-                self._unanswered.append(watched)
+            # an alarm at the run's last step is acted on when the run continues
+            self._unanswered = self._feed(block)
+            windows += self._unanswered
             if step is not None:
                 step(loop.time - begun, duration)
-        return SupervisedRun(Block.concatenate(blocks), windows, alerts, actions)
+        return SupervisedRun(Block.concatenate(blocks), windows, actions)
 
     def _feed(self, block: Block) -> list[WatchedWindow]:
         columns = {"accel_cmd": block.accel_cmd, "accel": block.accel, "speed": block.speed, "jerk": block.jerk}
