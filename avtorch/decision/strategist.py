@@ -10,13 +10,13 @@ A setting is *sufficient* when
 
 Among the sufficient settings the strategist takes the one of least `total`: the intrusiveness of `grid.py` plus
 `MARGIN` times the probability of string instability when the spread of the belief is doubled. The doubling accounts for
-the prior, which pulls the first posterior after a change towards the past. Settings are searched in order of
-intrusiveness, and the search ends when no remaining one could be better. Where no setting is sufficient, every setting
-that reaches `required` has been replayed; the strategist then takes the best P(string stable) among those that clip at
-most five percentage points more than the setting in force would have, and would have collided no harder (a leader who
-demands more than the car can do clips every setting). Where P does not discriminate, mostly because it is 0 for all,
-the peak gain at the belief's mean decides: a swing that grows 1.3 times per car is better than one that grows fivefold.
-Among equals intrusiveness is weighed against clipping. The decision's `sufficient` is then false.
+the prior, which pulls the first posterior after a change towards the past. Settings that reach `required` are replayed
+in that order, until no remaining one could be better. Where no setting is sufficient, every setting that reaches
+`required` has been replayed; the strategist then takes the best P(string stable) among those that clip at most five
+percentage points more than the setting in force would have, and would have collided no harder (a leader who demands
+more than the car can do clips every setting). Where P does not discriminate, mostly because it is 0 for all, the peak
+gain at the belief's mean decides: a swing that grows 1.3 times per car is better than one that grows fivefold. Among
+equals intrusiveness is weighed against clipping. The decision's `sufficient` is then false.
 """
 
 from __future__ import annotations
@@ -33,9 +33,7 @@ from avtorch.errors import InputError
 from avtorch.vehicle.arguments import Number
 from avtorch.vehicle.controllers import RAMP_RATE
 
-# Candidates evaluated, and replayed, at a time: with few scenarios a larger batch costs hardly more.
-_EVALUATED = 48
-_REPLAYED = 512
+_REPLAYED = 512  # at first; with few scenarios a larger batch costs hardly more
 _PAIRS = 1024
 _GAIN_PRICE = 0.05  # where none is sufficient, a peak gain e times as large weighs as much as this P(string stable)
 _HIGHEST_GAIN = 1e3  # a loop that is not even locally stable has no peak; it is worse than any that has
@@ -224,29 +222,19 @@ class _Search:
 
     def run(self) -> tuple[Tensor, Tensor]:
         """(choice, whether it is sufficient), (scenario,) each."""
-        cost = self.candidates.cost
-        order = cost.argsort(dim=1, stable=True)
-        best = torch.full((cost.shape[0],), torch.inf, dtype=torch.float64)
-        pick = torch.zeros(cost.shape[0], dtype=torch.long)
-        chunk = max(_EVALUATED, _REPLAYED // cost.shape[0])
-        for first in range(0, cost.shape[1], chunk):
-            column = order[:, first : first + chunk]
-            # The margin only adds cost: a setting that costs more even without it cannot win.
-            open_ = torch.nonzero(cost.gather(1, column[:, :1])[:, 0] < best)[:, 0]
-            if len(open_) == 0:
+        self._evaluate()
+        scenarios = len(self.T)
+        best = torch.full((scenarios,), torch.inf, dtype=torch.float64)
+        pick = torch.zeros(scenarios, dtype=torch.long)
+        tries = max(4, _REPLAYED // scenarios)
+        while True:
+            worth = (self.p >= self.rules.required) & ~self.replayed & (self.total < best[:, None])
+            if not bool(worth.any()):
                 break
-            self._evaluate(open_, column[open_])
-            tries = max(4, _REPLAYED // len(open_))
-            while True:
-                worth = (self.p[open_] >= self.rules.required) & ~self.replayed[open_]
-                worth &= self.total[open_] < best[open_, None]
-                if not bool(worth.any()):
-                    break
-                # Small chunks first, as the least intrusive setting usually is sufficient; larger ones where it is not.
-                self._replay(open_, worth, self.total[open_], tries)
-                tries *= 4
-                good = torch.where(self._sufficient(), self.total, torch.inf)
-                best, pick = good.min(dim=1)
+            # Small chunks first, as the least intrusive setting usually is sufficient; larger ones where it is not.
+            self._replay(torch.arange(scenarios), worth, self.total, tries)
+            tries *= 4
+            best, pick = torch.where(self._sufficient(), self.total, torch.inf).min(dim=1)
         lost = torch.nonzero(torch.isinf(best))[:, 0]
         if len(lost):
             pick[lost] = self._best_of_the_rest(lost)
@@ -287,15 +275,14 @@ class _Search:
         assert self.predictions is not None
         return self.predictions.map(lambda x: x[torch.arange(len(pick)), pick])
 
-    def _evaluate(self, rows: Tensor, columns: Tensor) -> None:
-        """P(string stable) and the price of the margin for some candidates (row, chunk).
+    def _evaluate(self) -> None:
+        """P(string stable) of every candidate on offer, and the price of the margin of those that reach what is
+        required.
 
         Most candidates fail clearly: a few draws screen them. One that reaches the required 0.95 is string stable in
         fewer than five of twelve draws once in 10⁸ times.
         """
-        r, c = rows[:, None].expand_as(columns).reshape(-1), columns.reshape(-1)
-        offered = torch.isfinite(self.candidates.cost[r, c])
-        r, c = r[offered], c[offered]
+        r, c = torch.nonzero(torch.isfinite(self.candidates.cost)).unbind(1)
         self.p[r, c] = self._probability(r, c, self.belief, every=self.belief[0].shape[1] // _SCREEN)
         left = self.p[r, c] > 0.4
         r, c = r[left], c[left]
