@@ -14,7 +14,7 @@ import avtorch.results
 from avtorch.cli import main
 from avtorch.cli.estimate import LINES as NAME
 from avtorch.cli.estimate import STATE as WINDOWS
-from avtorch.decision import kept_windows
+from avtorch.decision import estimation
 from avtorch.io import Log
 
 
@@ -81,9 +81,9 @@ def test_windows_done_before_are_not_computed_again(
 ) -> None:
     line, out = interrupted
     fed: list[float] = []
-    feed = kept_windows.Watch.feed
+    feed = estimation.Watch.feed
     monkeypatch.setattr(
-        kept_windows.Watch, "feed", lambda self, time, *a, **k: (fed.append(len(time)), feed(self, time, *a, **k))[1]
+        estimation.Watch, "feed", lambda self, time, *a, **k: (fed.append(len(time)), feed(self, time, *a, **k))[1]
     )
     assert main([*line, "--out", str(out)]) == 0
     assert 0 < sum(fed) < 900 - 600, "a row of the six windows that were finished was fed again"
@@ -92,7 +92,7 @@ def test_windows_done_before_are_not_computed_again(
 @pytest.mark.slow
 def test_a_killed_run_goes_on_from_what_was_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     line = ["estimate", two_segments(tmp_path / "drive.csv"), "--quiet", "--dead-time", "0"]
-    monkeypatch.setattr(kept_windows, "EVERY_S", 0.0)
+    monkeypatch.setattr(estimation, "EVERY_S", 0.0)
     out, killed, seen, entry = tmp_path / "out", tmp_path / "killed", [], avtorch.results.window_entry
 
     def copied(*args: Any) -> dict[str, Any]:
