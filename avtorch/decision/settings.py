@@ -93,7 +93,8 @@ class Setting:
 
     def map(self, change: Callable[[str, Tensor], Tensor]) -> Setting:
         """`change` of every field's name and tensor."""
-        return Setting(**{f.name: change(f.name, getattr(self, f.name)) for f in fields(self)})
+        parts: dict[str, Any] = {f.name: change(f.name, getattr(self, f.name)) for f in fields(self)}
+        return Setting(**parts)
 
     def __getitem__(self, index: Any) -> Setting:
         """Some of the scenarios, by index tensor, mask or slice."""

@@ -18,7 +18,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -155,7 +156,8 @@ class MPC:
         root = np.linalg.cholesky(self._H.numpy())
         targets = -np.linalg.solve(root, linear.numpy().T).T
         box = (self.accel_min, self.accel_max)
-        return torch.from_numpy(np.stack([lsq_linear(root.T, b, box, method="bvls").x for b in targets]))
+        solve = cast(Callable[..., Any], lsq_linear)
+        return torch.as_tensor(np.stack([solve(root.T, b, box, method="bvls").x for b in targets]))
 
     @property
     def gains(self) -> tuple[float, float, float]:
