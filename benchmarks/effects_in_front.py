@@ -26,7 +26,7 @@ from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.budget import Budget, Part
 from avtorch.io import Log
 from benchmarks.blindtest import IN_FRONT, put_in_front
-from benchmarks.blindtest.in_front_score import SIZE_OF, SIZE_WITHIN
+from benchmarks.blindtest.parameter_score import SIZE_OF, SIZE_WITHIN
 from benchmarks.budget_cells import causes, counted
 
 _COLUMNS = (

@@ -113,7 +113,7 @@ def run(
         acting = supervisor.run(
             seconds,
             events=[(change_at, change)],
-            progress=lambda done: step(done, (1 if strategy == "none" else 2) * seconds),
+            progress=lambda done, _: step(done, (1 if strategy == "none" else 2) * seconds),
         )
         alone = acting.rows if strategy == "none" else _unwatched(fresh(), seconds, change_at, change, step)
 
@@ -158,7 +158,7 @@ def _strategist(strategy: str, controller: str) -> Strategist | None:
     if strategy == "none":
         return None
     if controller == "mpc":
-        gains = lambda gap: MPC(time_gap=gap).equivalent_gains()  # noqa: E731
+        gains = lambda gap: MPC(time_gap=gap).gains  # noqa: E731
         return Strategist(Grid(allowed=ALLOWED[strategy] - {3}, gains_of_gap=gains))
     return Strategist(Grid(allowed=ALLOWED[strategy]))
 

@@ -10,7 +10,7 @@ Example:
 
 from avtorch.decision.algorithm2 import Algorithm2, algorithm2
 from avtorch.decision.estimation import Estimates, estimate
-from avtorch.decision.grid import Grid, Intrusiveness
+from avtorch.decision.grid import Grid
 from avtorch.decision.monitor import DEFAULT_DETECTORS, DETECTORS, Monitor, MonitorReport
 from avtorch.decision.replay import History, replay
 from avtorch.decision.settings import DesignBounds, Setting
@@ -29,7 +29,6 @@ __all__ = [
     "Estimates",
     "Grid",
     "History",
-    "Intrusiveness",
     "Monitor",
     "MonitorReport",
     "Setting",

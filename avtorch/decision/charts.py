@@ -28,6 +28,11 @@ from avtorch.errors import InputError
 ChartKind = Literal["shewhart", "ewma", "cusum"]
 CHARTS: tuple[ChartKind, ...] = ("shewhart", "ewma", "cusum")
 
+WEIGHT = 0.2
+"""EWMA's weight of the last window."""
+ALLOWANCE = 0.5
+"""CUSUM's allowance, half the shift it is best at [standard deviations]."""
+
 _NODES = 80  # the kernel is a smooth normal density: the ARL has settled to about ten digits by then
 
 
@@ -38,8 +43,6 @@ def shewhart_arl(limit: float) -> float:
 
 def ewma_arl(limit: float, weight: float) -> float:
     """In-control ARL [windows] of the two-sided EWMA chart from zero; `limit` in steady-state standard deviations."""
-    if weight == 1.0:
-        return shewhart_arl(limit)
     edge = limit * math.sqrt(weight / (2.0 - weight))
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     nodes, weights = nodes * edge, weights * edge
@@ -67,25 +70,18 @@ def cusum_arl(limit: float, reference: float) -> float:
 
 
 @lru_cache(maxsize=256)
-def chart_limit(kind: ChartKind, arl: float, *, weight: float = 0.2, reference: float = 0.5) -> float:
+def chart_limit(kind: ChartKind, arl: float) -> float:
     """Limit of a two-sided chart whose in-control average run length is `arl` [windows].
 
-    `weight` is EWMA's, in (0, 1]; `reference` is CUSUM's allowance, half the shift it is best at [standard deviations].
-    Raises `InputError` for an ARL of one window or less, or a bad weight or allowance.
+    Raises `InputError` for an ARL of one window or less, or one that the chart cannot have.
     """
     if not (math.isfinite(arl) and arl > 1.0):
         raise InputError(f"arl: found {arl}, need a finite number of windows above 1")
     if kind == "shewhart":
         return -float(torch.special.ndtri(torch.tensor(0.5 / arl, dtype=torch.float64)))
     if kind == "ewma":
-        if not 0.0 < weight <= 1.0:
-            raise InputError(f"weight: found {weight}, need a number above 0 and up to 1")
-        return _solve(lambda limit: ewma_arl(limit, weight), arl)
-    if kind == "cusum":
-        if not (math.isfinite(reference) and reference > 0.0):
-            raise InputError(f"reference: found {reference}, need a number above 0")
-        return _solve(lambda limit: cusum_arl(limit, reference), arl)
-    raise InputError(f"kind: found {kind!r}, need one of {', '.join(CHARTS)}")
+        return _solve(lambda limit: ewma_arl(limit, WEIGHT), arl)
+    return _solve(lambda limit: cusum_arl(limit, ALLOWANCE), arl)
 
 
 @dataclass
@@ -94,22 +90,19 @@ class Chart:
 
     Rates of alarms add, so with `components` innovations each chart is designed for `components * arl`: the scenario
     as a whole then alarms once per `arl` windows in control (exactly for Shewhart up to 1/arl, closely for the
-    others, whose run lengths are nearly geometric). `limit` is computed, never given. `last_statistic` is what the
-    last step compared with `edge`, kept before the restart of a chart that alarmed.
+    others, whose run lengths are nearly geometric). `last_statistic` is what the last step compared with `edge`, kept
+    before the restart of a chart that alarmed.
     """
 
     kind: ChartKind
     scenarios: int
     arl: float = 500.0
     components: int = 2
-    weight: float = 0.2
-    reference: float = 0.5
 
     def __post_init__(self) -> None:
-        self.limit = chart_limit(
-            self.kind, float(self.arl * self.components), weight=self.weight, reference=self.reference
-        )
-        self.edge = self.limit * (math.sqrt(self.weight / (2.0 - self.weight)) if self.kind == "ewma" else 1.0)
+        self.edge = chart_limit(self.kind, float(self.arl * self.components))
+        if self.kind == "ewma":
+            self.edge *= math.sqrt(WEIGHT / (2.0 - WEIGHT))
         self._arms = torch.zeros(self.scenarios, self.components, 2, dtype=torch.float64)
         self.last_statistic = torch.zeros(self.scenarios, self.components, dtype=torch.float64)
 
@@ -122,10 +115,10 @@ class Chart:
         if self.kind == "shewhart":
             arms = torch.stack([z, -z], dim=-1)
         elif self.kind == "ewma":
-            moved = (1.0 - self.weight) * self._arms[..., 0] + self.weight * z
+            moved = (1.0 - WEIGHT) * self._arms[..., 0] + WEIGHT * z
             arms = torch.stack([moved, -moved], dim=-1)
         else:
-            arms = (self._arms + torch.stack([z, -z], dim=-1) - self.reference).clamp_min(0.0)
+            arms = (self._arms + torch.stack([z, -z], dim=-1) - ALLOWANCE).clamp_min(0.0)
         statistic = arms.amax(dim=-1)
         alarm = (statistic > self.edge).any(dim=-1) & seen
         self._arms = torch.where(seen[:, None, None], arms, self._arms)

@@ -25,14 +25,14 @@ cost more than the sum:
 so that 1 -> 1.6 s costs 3.3, 1 -> 2.5 s costs 6, doubling k_v costs 3, and k_f 0 -> 0.5 costs 2: nobody in the car
 notices and no road capacity is lost, but the car then depends on a radio link. The lower level alone is cheapest (about
 2 to 3.7). Next come the lower level with one step of the gap or a mild change of gains, then the longest gap or a
-strong change of gains, then both gap and gains. All weights are parameters.
+strong change of gains, then both gap and gains.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -51,46 +51,25 @@ GAINS_GRID: tuple[tuple[float, float, float], ...] = (
 damps a slow one. k_s is kept, as it is neutral (paper, table on gains). The paper's own triple is among them."""
 
 
-@dataclass(frozen=True)
-class Intrusiveness:
-    """Weights of the cost in the module docstring; `margin` is the strategist's price of one that barely passes."""
+SWITCH = 1.0
+"""Price of anything that differs from what is in force."""
+MARGIN = 4.0
+"""The strategist's price of a setting that barely passes."""
 
-    update: float = 1.0
-    effort: float = 0.5
-    stale: float = 3.0
-    gap: float = 1.5
-    gap_length: float = 3.0
-    gains: float = 2.0
-    gains_change: float = 1.0
-    both: float = 2.0
-    link: float = 1.5
-    link_gain: float = 1.0
-    switch: float = 1.0
-    margin: float = 4.0
 
-    def __call__(self, setting: Setting, default: Setting, stale: Tensor) -> Tensor:
-        """Cost of settings relative to broadcasting defaults; `stale`: a model known to be wrong is kept."""
-        lower = setting.lower_differs(default)
-        effort = (setting.amplification() / default.amplification()).log2().clamp_min(0.0)
-        longer = (setting.time_gap / default.time_gap - 1.0).clamp_min(0.0)
-        k, k0 = setting.gains, default.gains
-        k = torch.cat([k[..., :2], 1.0 - k[..., 2:]], dim=-1)
-        k0 = torch.cat([k0[..., :2], 1.0 - k0[..., 2:]], dim=-1)
-        # A gain of zero or below has no ratio; the smallest float replaces it, so that it counts as a large change.
-        fed = (setting.feedforward - default.feedforward).abs()
-        octaves = (k.clamp_min(1e-3) / k0.clamp_min(1e-3)).log2().abs().sum(dim=-1)
-        return (
-            self.update * lower
-            + self.effort * effort
-            + self.stale * stale
-            + self.gap * (longer > 1e-9)
-            + self.gap_length * longer
-            + self.gains * (octaves > 1e-9)
-            + self.gains_change * octaves
-            + self.both * ((longer > 1e-9) & (octaves > 1e-9))
-            + self.link * (fed > 1e-9)
-            + self.link_gain * fed
-        )
+def intrusiveness(setting: Setting, default: Setting, stale: Tensor) -> Tensor:
+    """Cost of settings relative to broadcasting defaults, by the table of the module docstring but for its last line;
+    `stale`: a model known to be wrong is kept."""
+    effort = (setting.amplification() / default.amplification()).log2().clamp_min(0.0)
+    longer = (setting.time_gap / default.time_gap - 1.0).clamp_min(0.0)
+    # A gain of zero or below has no ratio; the smallest float replaces it, so that it counts as a large change.
+    k, k0 = (torch.cat([x[..., :2], 1.0 - x[..., 2:]], dim=-1).clamp_min(1e-3) for x in (setting.gains, default.gains))
+    octaves = (k / k0).log2().abs().sum(dim=-1)
+    fed = (setting.feedforward - default.feedforward).abs()
+    gap_differs, gains_differ = longer > 1e-9, octaves > 1e-9
+    lower = 1.0 * setting.lower_differs(default) + 0.5 * effort + 3.0 * stale
+    upper = 1.5 * gap_differs + 3.0 * longer + 2.0 * gains_differ + octaves + 2.0 * (gap_differs & gains_differ)
+    return lower + upper + 1.5 * (fed > 1e-9) + fed
 
 
 @dataclass(frozen=True)
@@ -130,7 +109,6 @@ class Grid:
     feedforward: Sequence[float] = ()
     allowed: frozenset[int] = frozenset({1, 2, 3, 4})
     gains_of_gap: Callable[[float], Sequence[float]] | None = None
-    intrusiveness: Intrusiveness = field(default_factory=Intrusiveness)
 
     def __post_init__(self) -> None:
         if not self.allowed <= {1, 2, 3, 4}:
@@ -166,27 +144,15 @@ class Grid:
         # An estimate at or below the default's target leaves one update, not several equal ones.
         fresh = torch.cat([torch.ones(scenarios, 1, dtype=torch.bool), (targets == 0.0) | (reach > 1e-9)], dim=1)
 
-        gaps = torch.cat([current.time_gap[:, None], column.time_gap, _listed(self.time_gaps, scenarios)], dim=1)
-        offered = torch.ones_like(gaps, dtype=torch.bool)
-        offered[:, 1:] = (gaps[:, 1:] - gaps[:, :1]).abs() > 1e-9
-        offered[:, 2:] &= gaps[:, 2:] > column.time_gap + 1e-9
-        if 2 not in self.allowed:
-            offered[:, 2:] = False
-
-        triples = self.gains if 3 in self.allowed else ()
-        gains = torch.cat([current.gains[:, None], default.gains[:, None], _listed(triples, scenarios, 3)], dim=1)
-        other = torch.ones(gains.shape[:2], dtype=torch.bool)
-        for i in range(2):
-            other[:, i + 1 :] &= (gains[:, i + 1 :] - gains[:, i, None]).abs().amax(dim=-1) > 1e-9
+        longer = _listed(self.time_gaps if 2 in self.allowed else (), scenarios)
+        gaps, new_gap = _axis(current.time_gap, default.time_gap, longer)
+        new_gap[:, 2:] &= gaps[:, 2:] > column.time_gap + 1e-9
+        triples = _listed(self.gains if 3 in self.allowed else (), scenarios, 3)
+        gains, new_gains = _axis(current.gains, default.gains, triples)
         if self.gains_of_gap is not None:
-            other[:, 1:] = False
-
-        links = self.feedforward if 4 in self.allowed else ()
-        fed = [current.feedforward[:, None], default.feedforward[:, None], _listed(links, scenarios)]
-        feedforward = torch.cat(fed, dim=1)
-        distinct = torch.ones_like(feedforward, dtype=torch.bool)
-        for i in range(2):
-            distinct[:, i + 1 :] &= (feedforward[:, i + 1 :] - feedforward[:, i, None]).abs() > 1e-9
+            new_gains[:, 1:] = False
+        links = _listed(self.feedforward if 4 in self.allowed else (), scenarios)
+        feedforward, new_link = _axis(current.feedforward, default.feedforward, links)
 
         axes = (T_d, gaps, gains, feedforward)
         lower, gap, gain, link = (
@@ -200,10 +166,20 @@ class Grid:
             T_hat[:, lower], K_hat[:, lower], T_d[:, lower], K_d[:, lower], gaps[:, gap], k, feedforward[:, link]
         )
         priced_default = column if self.gains_of_gap is None else column.replace(gains=k)
-        cost = self.intrusiveness(setting, priced_default, model_wrong[:, None] & (lower == 0))
-        cost = cost + self.intrusiveness.switch * setting.differs(current[:, None])
-        on_offer = fresh[:, lower] & offered[:, gap] & other[:, gain] & distinct[:, link]
+        cost = intrusiveness(setting, priced_default, model_wrong[:, None] & (lower == 0))
+        cost = cost + SWITCH * setting.differs(current[:, None])
+        on_offer = fresh[:, lower] & new_gap[:, gap] & new_gains[:, gain] & new_link[:, link]
         return Candidates(setting, torch.where(on_offer, cost, torch.inf))
+
+
+def _axis(now: Tensor, default: Tensor, listed: Tensor) -> tuple[Tensor, Tensor]:
+    """What is in force, the default and what is listed, (scenario, value, ...); and which are not there before."""
+    values = torch.cat([now[:, None], default[:, None], listed], dim=1)
+    new = torch.ones(values.shape[:2], dtype=torch.bool)
+    for i in range(2):
+        differs = (values[:, i + 1 :] - values[:, i, None]).abs() > 1e-9
+        new[:, i + 1 :] &= differs if values.ndim == 2 else differs.any(dim=-1)
+    return values, new
 
 
 def _listed(values: Sequence[Any], scenarios: int, *shape: int) -> Tensor:

@@ -93,14 +93,13 @@ class Monitor:
 
     accepted: (T_L [s], K_L [-]) accepted at the start, numbers or (scenario,); change: accepted change of the two.
     certainty: posterior probability of being outside that an `accepted_change` alarm takes. stability_level: an alarm
-    where P(string stable) or P(locally stable) is below it; a little below the 0.95 a new setting must reach, so that
+    where P(string stable) is below it; a little below the 0.95 a new setting must reach, so that
     scatter in the next window does not raise an alarm on a sufficient setting. false_alarm_rate: of each divergence
-    detector, per excited window. arl: in-control average run length of each chart [excited windows]. inflation: ratio
-    of window-to-window spread to posterior SD, 1 for a posterior of the right width. unevenness: SDs, as shares of T_L
-    and K_L, by which a sound vehicle differs from window to window: divergences and charts without it alarm on any car
-    that is not GLVD to a per cent (0.1 and 0.03 kept them quiet, benchmarks/detectors). dead_time [s]: of the vehicle,
-    number or (scenario,). link_delay [s]: of the leader's acceleration where it is fed forward. Raises `InputError` for
-    unknown detectors and numbers out of range.
+    detector, per excited window. arl: in-control average run length of each chart [excited windows]. unevenness: SDs,
+    as shares of T_L and K_L, by which a sound vehicle differs from window to window: divergences and charts without it
+    alarm on any car that is not GLVD to a per cent (0.1 and 0.03 kept them quiet, benchmarks/detectors). dead_time [s]:
+    of the vehicle, number or (scenario,). link_delay [s]: of the leader's acceleration where it is fed forward. Raises
+    `InputError` for unknown detectors and numbers out of range.
 
     Example:
         >>> import torch
@@ -125,7 +124,6 @@ class Monitor:
         stability_level: float = 0.9,
         false_alarm_rate: float = 0.002,
         arl: float = 500.0,
-        inflation: float = 1.0,
         unevenness: tuple[float, float] = (0.0, 0.0),
         dead_time: float | Tensor = 0.0,
         link_delay: float = 0.0,
@@ -142,8 +140,6 @@ class Monitor:
                 raise InputError(f"{name}: found {value}, need a number between 0 and 1")
         if not (change[0] > 0.0 and change[1] > 0.0):
             raise InputError(f"change: found {change}, need two numbers above 0")
-        if not inflation >= 1.0:
-            raise InputError(f"inflation: found {inflation}, need 1 or more")
         if len(unevenness) != 2 or not all(u >= 0.0 for u in unevenness):
             raise InputError(f"unevenness: found {unevenness}, need two numbers of 0 or more")
         if scenarios < 1:
@@ -154,7 +150,6 @@ class Monitor:
         self.certainty = certainty
         self.stability_level = stability_level
         self.false_alarm_rate = false_alarm_rate
-        self.inflation = inflation
         self.unevenness = unevenness
         self.dead_time = dead_time
         self.link_delay = link_delay
@@ -182,7 +177,7 @@ class Monitor:
             raise InputError(f"excited: found {tuple(excited.shape)}, need ({self.scenarios},)")
         T_L, K_L = T_L.to(torch.float64), K_L.to(torch.float64)
         mean = (T_L.mean(dim=-1), K_L.mean(dim=-1))
-        window = self._gaussian(T_L, K_L)
+        window = Gaussian.of_draws(T_L, K_L, unevenness=self.unevenness)
         p_local, p_string = setting.p_locally_and_string_stable(
             T_L, K_L, dead_time=self.dead_time, link_delay=self.link_delay
         )
@@ -194,7 +189,7 @@ class Monitor:
         baseline = _choose(self._has_baseline, self._baseline, window)
         for name in self.detectors:
             if name == "stability":
-                statistics[name] = torch.minimum(p_string, p_local)
+                statistics[name] = p_string  # implies local stability, draw by draw
                 alerts[name] = excited & (statistics[name] < self.stability_level)
             elif name == "accepted_change":
                 alarmed, statistics[name] = self._accepted_change(T_L, K_L, mean)
@@ -263,9 +258,6 @@ class Monitor:
         self._has_baseline = state["has_baseline"].clone()
         for name, chart in self._charts.items():
             chart.load_state_dict(state["charts"][name])
-
-    def _gaussian(self, T_L: Tensor, K_L: Tensor) -> Gaussian:
-        return Gaussian.of_draws(T_L, K_L, inflation=self.inflation, unevenness=self.unevenness)
 
     def _accepted_change(self, T_L: Tensor, K_L: Tensor, mean: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         """(alarm, probability of being outside) (scenario,), of T_L or K_L, whichever is outside more probably."""

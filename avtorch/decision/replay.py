@@ -7,14 +7,15 @@ rate. From it the strategist predicts clipping and cost before it acts on the ca
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from avtorch.decision.settings import Number, Setting
+from avtorch.decision.settings import Setting
 from avtorch.errors import InputError
+from avtorch.vehicle.arguments import Number
 from avtorch.vehicle.block import Block
 from avtorch.vehicle.controllers import RAMP_RATE
 from avtorch.vehicle.leader import Leader
@@ -94,13 +95,9 @@ class Prediction:
     command_rms_mps2: Tensor
     amplification: Tensor
 
-    def map(self, change: object) -> Prediction:
+    def map(self, change: Callable[[Tensor], Tensor]) -> Prediction:
         """Apply a function of a tensor to every field."""
-        return Prediction(**{name: change(value) for name, value in vars(self).items()})  # type: ignore[operator]
-
-    def as_dict(self, scenario: int = 0) -> dict[str, float]:
-        """One scenario's figures, for a prediction of shape (scenario,)."""
-        return {name: float(value[scenario]) for name, value in vars(self).items()}
+        return Prediction(**{name: change(value) for name, value in vars(self).items()})
 
 
 @torch.no_grad()
@@ -136,7 +133,7 @@ def replay(
             setting[rows],
             plant=GLVDPlant(T_L[rows], K_L[rows], 0.0),
             time_gap_now=time_gap_now[rows],
-            limits=(_pick(accel_min, rows), _pick(accel_max, rows)),
+            limits=(of_scenarios(accel_min, rows), of_scenarios(accel_max, rows)),
             standstill=standstill,
             ramp_rate=ramp_rate,
             delay=delay,
@@ -177,7 +174,7 @@ def _replay_at(
     parts = []
     each = max(1, _ROWS // scenarios)
     for first in range(0, candidates, each):
-        some = setting[:, first : first + each].transposed()
+        some = setting[:, first : first + each].map(lambda _, x: x.transpose(0, 1))  # (candidate, scenario)
         twin = loop.copy(candidates=some.shape[0])
         start = Setting(time_gap=time_gap_now, gains=some.gains).controller(standstill=standstill)
         twin.controller = some.retarget(start, at=delay, rate=ramp_rate)
@@ -186,7 +183,8 @@ def _replay_at(
     return Prediction(*(torch.cat(column).mT for column in zip(*(vars(p).values() for p in parts), strict=True)))
 
 
-def _pick(limit: Number, rows: Tensor) -> Number:
+def of_scenarios(limit: Number, rows: Tensor) -> Number:
+    """The limits of some of the scenarios, from one for all or one each."""
     return limit[rows] if isinstance(limit, Tensor) and limit.ndim else limit
 
 

@@ -8,7 +8,7 @@ that the paper names). The formulas are in `avtorch.vehicle`; this file only pas
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -18,12 +18,10 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.vehicle import stability
-from avtorch.vehicle.arguments import broadcast_shape
+from avtorch.vehicle.arguments import Number, broadcast_shape, checked
 from avtorch.vehicle.controllers import NOMINAL_GAINS, RAMP_RATE, LinearController
 from avtorch.vehicle.lower_level import LowerLevel
 from avtorch.vehicle.stability.conditions import Conditions, Form
-
-Number = float | Tensor
 
 DRIVER_TIME_GAPS = (1.0, 1.6, 2.5)
 """Time gaps [s] a driver can choose from in commercial adaptive cruise control (paper, Section 4.5)."""
@@ -69,17 +67,11 @@ class Setting:
         scenarios: int | None = None,
     ) -> None:
         given = {"T_hat": T_hat, "K_hat": K_hat, "T_d": T_d, "K_d": K_d, "time_gap": time_gap}
-        parts = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in given.items()}
-        for name, value in parts.items():
-            bad = ~(torch.isfinite(value) & (value > 0.0))
-            if bool(bad.any()):
-                raise InputError(f"{name}: found {float(value[bad].reshape(-1)[0])}, need a finite number above 0")
-        k_f = torch.as_tensor(feedforward, dtype=torch.float64)
-        if not bool(torch.isfinite(k_f).all()):
-            raise InputError(f"feedforward: found {float(k_f[~torch.isfinite(k_f)][0])}, need a finite number")
-        k = torch.as_tensor(gains, dtype=torch.float64)
-        if k.ndim == 0 or k.shape[-1] != 3 or not bool(torch.isfinite(k).all()):
-            raise InputError(f"gains: found {tuple(k.shape)} values, need finite (k_s, k_v, k_a) on the last dimension")
+        parts = {name: checked(name, value, above=0.0).to(torch.float64) for name, value in given.items()}
+        k_f = checked("feedforward", feedforward).to(torch.float64)
+        k = checked("gains", gains).to(torch.float64)
+        if k.ndim == 0 or k.shape[-1] != 3:
+            raise InputError(f"gains: found {tuple(k.shape)} values, need (k_s, k_v, k_a) on the last dimension")
         try:
             shape = broadcast_shape(
                 *(v.shape for v in parts.values()), k.shape[:-1], k_f.shape, (1,) if scenarios is None else (scenarios,)
@@ -99,13 +91,14 @@ class Setting:
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
 
+    def map(self, change: Callable[[str, Tensor], Tensor]) -> Setting:
+        """`change` of every field's name and tensor."""
+        parts: dict[str, Any] = {f.name: change(f.name, getattr(self, f.name)) for f in fields(self)}
+        return Setting(**parts)
+
     def __getitem__(self, index: Any) -> Setting:
         """Some of the scenarios, by index tensor, mask or slice."""
-        return Setting(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
-
-    def transposed(self) -> Setting:
-        """(scenario, candidate) as (candidate, scenario), the way the closed loop takes it."""
-        return Setting(**{f.name: getattr(self, f.name).transpose(0, 1) for f in fields(self)})
+        return self.map(lambda _, x: x[index])
 
     def lower_level(self, *, accel_min: Number = -6.0, accel_max: Number = 4.0) -> LowerLevel:
         """The lower level of this setting in a vehicle with the given limits [m/s²]."""
@@ -137,44 +130,32 @@ class Setting:
         Fields (scenario, candidate) go with draws (scenario, 1, draw). `dead_time` [s], and `link_delay` [s] of the
         leader's acceleration, are numbers or of the shape of the fields.
         """
-        T_e, K_e = self.effective(T_L, K_L)
-        return stability.p_string_stable(
-            T_e,
-            K_e,
-            self.time_gap,
-            self.gains,
-            dead_time=_per_draw(dead_time),
-            feedforward=self.feedforward,
-            feedforward_delay=link_delay,
-        )
-
-    def p_locally_stable(self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0) -> Tensor:
-        """P(locally stable), arguments as in `p_string_stable`."""
-        T_e, K_e = self.effective(T_L, K_L)
-        return stability.p_locally_stable(T_e, K_e, self.time_gap, self.gains, dead_time=_per_draw(dead_time))
+        return self._over_draws(stability.p_string_stable, T_L, K_L, dead_time, link_delay)
 
     def p_locally_and_string_stable(
         self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0, link_delay: Number = 0.0
     ) -> tuple[Tensor, Tensor]:
-        """Both probabilities at once, arguments as in `p_string_stable`."""
-        T_e, K_e = self.effective(T_L, K_L)
-        return stability.p_locally_and_string_stable(
-            T_e,
-            K_e,
-            self.time_gap,
-            self.gains,
-            dead_time=_per_draw(dead_time),
-            feedforward=self.feedforward,
-            feedforward_delay=link_delay,
-        )
+        """P(locally stable) and P(string stable), arguments as in `p_string_stable`."""
+        return self._over_draws(stability.p_locally_and_string_stable, T_L, K_L, dead_time, link_delay)
 
     def peak_gain(self, T_L: Number, K_L: Number, *, dead_time: Number = 0.0, link_delay: Number = 0.0) -> Tensor:
         """Peak gain (scenario,) at one plant per scenario, through (T_e, K_e): the score of a choice at the true
         plant."""
-        T_e, K_e = self.lower_level().effective(T_L, K_L)
-        return stability.peak_gain(
-            T_e,
-            K_e,
+        actuation = self.lower_level().effective(T_L, K_L)
+        return self._verdict(stability.peak_gain, actuation, dead_time, link_delay)
+
+    def _over_draws(
+        self, verdict: Callable[..., Any], T_L: Tensor, K_L: Tensor, dead_time: Number, link_delay: Number
+    ) -> Any:
+        if isinstance(dead_time, Tensor) and dead_time.ndim:
+            dead_time = dead_time.unsqueeze(-1)
+        return self._verdict(verdict, self.effective(T_L, K_L), dead_time, link_delay)
+
+    def _verdict(
+        self, verdict: Callable[..., Any], actuation: tuple[Tensor, Tensor], dead_time: Number, link_delay: Number
+    ) -> Any:
+        return verdict(
+            *actuation,
             self.time_gap,
             self.gains,
             dead_time=dead_time,
@@ -274,10 +255,6 @@ class DesignBounds:
             stability.local_conditions(self.T_L, self.K_L, time_gap, gains, form=form),
             stability.string_conditions(self.T_L, self.K_L, time_gap, gains, form=form),
         )
-
-
-def _per_draw(number: Number) -> Number:
-    return number.unsqueeze(-1) if isinstance(number, Tensor) and number.ndim else number
 
 
 def _differs(a: Tensor, b: Tensor) -> Tensor:

@@ -9,33 +9,31 @@ A setting is *sufficient* when
    without this condition, inverting a slow actuator would always win on paper.
 
 Among the sufficient settings the strategist takes the one of least `total`: the intrusiveness of `grid.py` plus
-`margin` times the probability of string instability when the spread of the belief is doubled. The doubling accounts for
-the prior, which pulls the first posterior after a change towards the past. Settings are searched in order of
-intrusiveness, and the search ends when no remaining one could be better. Where no setting is sufficient, every setting
-that reaches `required` has been replayed; the strategist then takes the best P(string stable) among those that clip at
-most five percentage points more than the setting in force would have, and would have collided no harder (a leader who
-demands more than the car can do clips every setting). Where P does not discriminate, mostly because it is 0 for all,
-the peak gain at the belief's mean decides: a swing that grows 1.3 times per car is better than one that grows fivefold.
-Among equals intrusiveness is weighed against clipping. The decision's `sufficient` is then false.
+`MARGIN` times the probability of string instability when the spread of the belief is doubled. The doubling accounts for
+the prior, which pulls the first posterior after a change towards the past. Settings that reach `required` are replayed
+in that order, until no remaining one could be better. Where no setting is sufficient, every setting that reaches
+`required` has been replayed; the strategist then takes the best P(string stable) among those that clip at most five
+percentage points more than the setting in force would have, and would have collided no harder (a leader who demands
+more than the car can do clips every setting). Where P does not discriminate, mostly because it is 0 for all, the peak
+gain at the belief's mean decides: a swing that grows 1.3 times per car is better than one that grows fivefold. Among
+equals intrusiveness is weighed against clipping. The decision's `sufficient` is then false.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from avtorch.decision.grid import Candidates, Grid
+from avtorch.decision.grid import MARGIN, Candidates, Grid
 from avtorch.decision.replay import History, Prediction, replay
-from avtorch.decision.settings import Number, Setting
+from avtorch.decision.settings import Setting
 from avtorch.errors import InputError
+from avtorch.vehicle.arguments import Number
 from avtorch.vehicle.controllers import RAMP_RATE
 
-# Candidates evaluated, and replayed, at a time: with few scenarios a larger batch costs hardly more.
-_EVALUATED = 48
-_REPLAYED = 512
+_REPLAYED = 512  # at first; with few scenarios a larger batch costs hardly more
 _PAIRS = 1024
 _GAIN_PRICE = 0.05  # where none is sufficient, a peak gain e times as large weighs as much as this P(string stable)
 _HIGHEST_GAIN = 1e3  # a loop that is not even locally stable has no peak; it is worse than any that has
@@ -47,38 +45,21 @@ _SCREEN = 12
 class Decision:
     """The decision for each scenario; every tensor (scenario,).
 
-    `setting`: the choice. `sufficient`: whether it meets both conditions; `p_string_stable` under the belief, and
-    `p_robust` with the spread doubled. `intrusiveness` as in `grid.py`. `predicted`: clipping and costs in the replay.
-    `strategies` lead from the default to the choice; `changes`: it differs from the setting in force. `why`: one
-    sentence each. `interim`: the setting until the driver has set the longer time gap, `p_interim` its P(string
-    stable), `driver_delay_s` the time allowed for it; where no driver is asked, 0 and the choice itself.
+    `setting`: the choice. `sufficient`: whether it meets both conditions; `p_string_stable` under the belief.
+    `intrusiveness` as in `grid.py`. `predicted`: clipping and costs in the replay. `strategies` lead from the default
+    to the choice; `changes`: it differs from the setting in force. `driver_delay_s`: the time that the driver is
+    allowed to set a longer time gap, 0 where none is asked. `why`: one sentence each.
     """
 
     setting: Setting
     sufficient: Tensor
     p_string_stable: Tensor
-    p_robust: Tensor
     intrusiveness: Tensor
     predicted: Prediction
     strategies: list[set[int]]
     changes: Tensor
-    why: list[str]
-    interim: Setting
-    p_interim: Tensor
     driver_delay_s: Tensor
-
-    def as_dict(self, scenario: int = 0) -> dict[str, Any]:
-        """One scenario as an action of `run.json` (without its time), costs beside it."""
-        asked = float(self.driver_delay_s[scenario])
-        return {
-            "strategies": sorted(self.strategies[scenario]),
-            "settings": self.setting.as_dict(scenario),
-            "why": self.why[scenario],
-            "p_string_stable": float(self.p_string_stable[scenario]),
-            "sufficient": bool(self.sufficient[scenario]),
-            "predicted": self.predicted.as_dict(scenario),
-            "driver_delay_s": asked,
-        }
+    why: list[str]
 
 
 @dataclass(frozen=True)
@@ -155,159 +136,105 @@ class Strategist:
             )
         T_L, K_L = T_L.to(torch.float64), K_L.to(torch.float64)
         wrong = torch.ones(scenarios, dtype=torch.bool) if model_wrong is None else model_wrong
+        mean = (T_L.mean(dim=-1), K_L.mean(dim=-1))
+        every = max(1, T_L.shape[1] // self.draws)
         search = _Search(
             self,
-            T_L,
-            K_L,
+            self.grid.candidates(*mean, current=current, default=default, model_wrong=wrong),
             history,
-            current=current,
-            default=default,
+            belief=(T_L[:, ::every], K_L[:, ::every]),
+            mean=mean,
             time_gap_now=current.time_gap if time_gap_now is None else time_gap_now,
-            wrong=wrong,
             limits=(torch.as_tensor(accel_min).expand(scenarios), torch.as_tensor(accel_max).expand(scenarios)),
         )
         pick, sufficient = search.run()
         rows = torch.arange(scenarios)
         chosen = search.candidates.setting[rows, pick]
-        p = self.probability(chosen, T_L, K_L)
-        deaf = p if not bool(chosen.feedforward.any()) else self.probability(chosen.replace(feedforward=0.0), T_L, K_L)
-        longer = chosen.time_gap > current.time_gap + 1e-9
-        asked = longer & (self.driver_delay > 0.0)
-        interim = chosen.replace(time_gap=torch.where(asked, current.time_gap, chosen.time_gap))
         predicted = search.prediction(pick)
+        p = self.probability(chosen, T_L, K_L)
+        p_deaf = p
+        if bool(chosen.feedforward.any()):
+            p_deaf = self.probability(chosen.replace(feedforward=0.0), T_L, K_L)
+        asked = (chosen.time_gap > current.time_gap + 1e-9) & (self.driver_delay > 0.0)
         # Gains that follow from the gap are no strategy of their own.
         follow = self.grid.gains_of_gap is not None
         strategies = chosen.strategies(default.replace(gains=chosen.gains) if follow else default)
-        return Decision(
-            setting=chosen,
-            sufficient=sufficient,
-            p_string_stable=p,
-            p_robust=self.probability(chosen, *_widened(T_L, K_L)),
-            intrusiveness=search.candidates.cost[rows, pick],
-            predicted=predicted,
-            strategies=strategies,
-            changes=chosen.differs(current),
-            why=self._reasons(
-                chosen,
-                current=current,
-                default=default,
-                strategies=strategies,
-                sufficient=sufficient,
-                p_string_stable=p,
-                p_deaf=deaf,
-                predicted=predicted,
-                asked=asked,
-                seconds=history.seconds,
-            ),
-            interim=interim,
-            p_interim=self.probability(interim, T_L, K_L),
-            driver_delay_s=asked * self.driver_delay,
-        )
-
-    def _reasons(
-        self,
-        chosen: Setting,
-        *,
-        current: Setting,
-        default: Setting,
-        strategies: list[set[int]],
-        sufficient: Tensor,
-        p_string_stable: Tensor,
-        p_deaf: Tensor,
-        predicted: Prediction,
-        asked: Tensor,
-        seconds: float,
-    ) -> list[str]:
-        """Why a setting was chosen, in one plain sentence per scenario; tensors are (scenario,).
-
-        `p_deaf`: P(string stable) if the leader's acceleration is no longer received. `asked`: the driver is asked to
-        set the gap. `seconds` [s] of the past over which `predicted` was replayed.
-        """
-        out = []
+        why = []
         for i, used in enumerate(strategies):
-            now, was = chosen.as_dict(i), current.as_dict(i)
-            steps = []
-            if 1 in used:
-                steps.append(
-                    f"lower level models T {now['T_hat']:.2f} s, K {now['K_hat']:.2f} and targets {now['T_d']:.2f} s"
-                )
-            if 2 in used:
-                verb = "driver asked for a time gap of" if bool(asked[i]) else "time gap"
-                steps.append(f"{verb} {now['time_gap_s']:g} s instead of {float(default.time_gap[i]):g} s")
-            if 3 in used:
-                steps.append("gains " + ", ".join(f"{k:g}" for k in now["gains"]))
-            if 4 in used:
-                lost = f"P(string stable) {float(p_deaf[i]):.2f} if the link is lost"
-                steps.append(f"leader's acceleration fed forward with k_f {now['feedforward']:g} ({lost})")
-            what = "; ".join(steps) if steps else "default setting"
-            if now == was:
+            what = _steps(used, chosen[i : i + 1], default[i : i + 1], bool(asked[i]), float(p_deaf[i]))
+            if chosen.as_dict(i) == current.as_dict(i):
                 what = f"setting in force stays ({what})"
-            clipped = 100.0 * float(predicted.clipped_share[i])
-            past = f"{clipped:.1f} % of commands clipped in a replay of the past {seconds:.0f} s"
-            result = f"P(string stable) {float(p_string_stable[i]):.2f}, {past}"
+            clipped = f"{100.0 * float(predicted.clipped_share[i]):.1f} % of commands clipped"
+            past = f"{clipped} in a replay of the past {history.seconds:.0f} s"
+            result = f"P(string stable) {float(p[i]):.2f}, {past}"
             if bool(sufficient[i]):
-                out.append(f"least intrusive sufficient setting: {what} ({result})")
+                why.append(f"least intrusive sufficient setting: {what} ({result})")
             else:
-                least, most = f"{self.required:g}", f"{100 * self.most_clipped:g}"
-                missed = f"keeps P(string stable) at {least} with {most} % of commands clipped or less"
-                out.append(f"no setting of the grid {missed}; the best one: {what} ({result})")
-        return out
+                aim = f"at {self.required:g} with {100 * self.most_clipped:g} % of commands clipped or less"
+                why.append(f"no setting of the grid keeps P(string stable) {aim}; the best one: {what} ({result})")
+        cost, changes = search.candidates.cost[rows, pick], chosen.differs(current)
+        return Decision(chosen, sufficient, p, cost, predicted, strategies, changes, asked * self.driver_delay, why)
+
+
+def _steps(used: set[int], chosen: Setting, default: Setting, asked: bool, p_deaf: float) -> str:
+    """The steps of the strategies `used` from one scenario's default to its choice, in words.
+
+    `asked`: the driver is asked to set the gap. `p_deaf`: P(string stable) if the leader's acceleration is no longer
+    received.
+    """
+    now = chosen.as_dict()
+    steps = []
+    if 1 in used:
+        steps.append(f"lower level models T {now['T_hat']:.2f} s, K {now['K_hat']:.2f} and targets {now['T_d']:.2f} s")
+    if 2 in used:
+        verb = "driver asked for a time gap of" if asked else "time gap"
+        steps.append(f"{verb} {now['time_gap_s']:g} s instead of {float(default.time_gap[0]):g} s")
+    if 3 in used:
+        steps.append("gains " + ", ".join(f"{k:g}" for k in now["gains"]))
+    if 4 in used:
+        lost = f"P(string stable) {p_deaf:.2f} if the link is lost"
+        steps.append(f"leader's acceleration fed forward with k_f {now['feedforward']:g} ({lost})")
+    return "; ".join(steps) if steps else "default setting"
 
 
 class _Search:
-    """One decision's search over (scenario, candidate)."""
+    """One decision's search over (scenario, candidate); `belief` are the draws used, `mean` of all of them."""
 
     def __init__(
         self,
         rules: Strategist,
-        T_L: Tensor,
-        K_L: Tensor,
+        candidates: Candidates,
         history: History,
         *,
-        current: Setting,
-        default: Setting,
+        belief: tuple[Tensor, Tensor],
+        mean: tuple[Tensor, Tensor],
         time_gap_now: Tensor,
-        wrong: Tensor,
         limits: tuple[Tensor, Tensor],
     ) -> None:
-        self.rules, self.history, self.gap_now, self.limits = rules, history, time_gap_now, limits
-        self.T, self.K = T_L.mean(dim=-1), K_L.mean(dim=-1)
-        every = max(1, T_L.shape[1] // rules.draws)
-        self.belief = (T_L[:, ::every], K_L[:, ::every])
-        self.candidates: Candidates = rules.grid.candidates(
-            self.T, self.K, current=current, default=default, model_wrong=wrong
-        )
-        shape = self.candidates.cost.shape
+        self.rules, self.candidates, self.history, self.belief = rules, candidates, history, belief
+        self.gap_now, self.limits = time_gap_now, limits
+        self.T, self.K = mean
+        shape = candidates.cost.shape
         self.p = torch.full(shape, torch.nan, dtype=torch.float64)
-        self.total = self.candidates.cost.clone()
+        self.total = candidates.cost.clone()
         self.predictions: Prediction | None = None
         self.replayed = torch.zeros(shape, dtype=torch.bool)
 
     def run(self) -> tuple[Tensor, Tensor]:
         """(choice, whether it is sufficient), (scenario,) each."""
-        cost = self.candidates.cost
-        order = cost.argsort(dim=1, stable=True)
-        best = torch.full((cost.shape[0],), torch.inf, dtype=torch.float64)
-        pick = torch.zeros(cost.shape[0], dtype=torch.long)
-        chunk = max(_EVALUATED, _REPLAYED // cost.shape[0])
-        for first in range(0, cost.shape[1], chunk):
-            column = order[:, first : first + chunk]
-            # The margin only adds cost: a setting that costs more even without it cannot win.
-            open_ = torch.nonzero(cost.gather(1, column[:, :1])[:, 0] < best)[:, 0]
-            if len(open_) == 0:
+        self._evaluate()
+        scenarios = len(self.T)
+        best = torch.full((scenarios,), torch.inf, dtype=torch.float64)
+        pick = torch.zeros(scenarios, dtype=torch.long)
+        tries = max(4, _REPLAYED // scenarios)
+        while True:
+            worth = (self.p >= self.rules.required) & ~self.replayed & (self.total < best[:, None])
+            if not bool(worth.any()):
                 break
-            self._evaluate(open_, column[open_])
-            tries = max(4, _REPLAYED // len(open_))
-            while True:
-                worth = (self.p[open_] >= self.rules.required) & ~self.replayed[open_]
-                worth &= self.total[open_] < best[open_, None]
-                if not bool(worth.any()):
-                    break
-                # Small chunks first, as the least intrusive setting usually is sufficient; larger ones where it is not.
-                self._replay(open_, worth, self.total[open_], tries)
-                tries *= 4
-                good = torch.where(self._sufficient(), self.total, torch.inf)
-                best, pick = good.min(dim=1)
+            # Small chunks first, as the least intrusive setting usually is sufficient; larger ones where it is not.
+            self._replay(torch.arange(scenarios), worth, self.total, tries)
+            tries *= 4
+            best, pick = torch.where(self._sufficient(), self.total, torch.inf).min(dim=1)
         lost = torch.nonzero(torch.isinf(best))[:, 0]
         if len(lost):
             pick[lost] = self._best_of_the_rest(lost)
@@ -348,15 +275,14 @@ class _Search:
         assert self.predictions is not None
         return self.predictions.map(lambda x: x[torch.arange(len(pick)), pick])
 
-    def _evaluate(self, rows: Tensor, columns: Tensor) -> None:
-        """P(string stable) and the price of the margin for some candidates (row, chunk).
+    def _evaluate(self) -> None:
+        """P(string stable) of every candidate on offer, and the price of the margin of those that reach what is
+        required.
 
         Most candidates fail clearly: a few draws screen them. One that reaches the required 0.95 is string stable in
         fewer than five of twelve draws once in 10⁸ times.
         """
-        r, c = rows[:, None].expand_as(columns).reshape(-1), columns.reshape(-1)
-        offered = torch.isfinite(self.candidates.cost[r, c])
-        r, c = r[offered], c[offered]
+        r, c = torch.nonzero(torch.isfinite(self.candidates.cost)).unbind(1)
         self.p[r, c] = self._probability(r, c, self.belief, every=self.belief[0].shape[1] // _SCREEN)
         left = self.p[r, c] > 0.4
         r, c = r[left], c[left]
@@ -364,7 +290,7 @@ class _Search:
         left = self.p[r, c] >= self.rules.required
         r, c = r[left], c[left]
         unstable = 1.0 - self._probability(r, c, _widened(*self.belief), every=2)
-        self.total[r, c] += self.rules.grid.intrusiveness.margin * unstable
+        self.total[r, c] += MARGIN * unstable
 
     def _probability(self, r: Tensor, c: Tensor, belief: tuple[Tensor, Tensor], *, every: int = 1) -> Tensor:
         """P(string stable) of the pairs (scenario r, candidate c), from every n-th draw."""

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from avtorch.decision.monitor import Monitor
-from avtorch.decision.replay import History
+from avtorch.decision.replay import History, of_scenarios
 from avtorch.decision.settings import Setting
 from avtorch.decision.strategist import Strategist
-from avtorch.decision.watch import Action, Alert, SupervisedRun, Watch, WatchedWindow
-from avtorch.display.progress import asks_for_bar, called, progress_bar
+from avtorch.decision.watch import Action, SupervisedRun, Watch, WatchedWindow
+from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.inference.form import JerkForm
 from avtorch.inference.latent import LatentForm
@@ -29,8 +28,6 @@ _NEVER = 2**62  # steps
 
 HISTORY_S = 20.0
 """Length that the strategist replays [s]: ten windows, long enough for one manoeuvre of the leader."""
-
-Strategy = Literal["auto", "1", "2", "3"]
 
 ALLOWED: dict[str, frozenset[int]] = {
     "auto": frozenset({1, 2, 3}),
@@ -99,7 +96,9 @@ class Supervisor:
             )
         if strategist is not None:
             _check_reach(strategist, loop)
-        self.setting = read_setting(loop) if setting is None else _for_scenarios(setting, n)
+        self.setting = read_setting(loop) if setting is None else setting.replace(scenarios=n)
+        if self.setting.shape != (n,):
+            raise InputError(f"setting: found shape {tuple(self.setting.shape)}, needs one or {n} scenarios")
         if monitor is None:
             dead_time = 0.0 if strategist is None else strategist.dead_time
             accepted = (self.setting.T_hat, self.setting.K_hat)
@@ -117,38 +116,26 @@ class Supervisor:
         self._recent: list[Block] = []
         self._unanswered: list[WatchedWindow] = []
 
+    @shows_progress
     def run(
         self,
         duration: float,
         *,
         events: Sequence[tuple[float, Callable[[ClosedLoop], None]]] = (),
-        progress: Callable[[float], None] | bool | None = None,
+        progress: Callable[[float, float], None] | bool | None = None,
     ) -> SupervisedRun:
         """Advance by `duration` [s]. `events` are `(time [s], change)`: `change(loop)` is called at that time.
 
-        `progress(seconds done)` is called after each window; or True, False, None, as in `avtorch.diagnose`. Raises
+        `progress(done, of)` [s] is called after each window; or True, False, None, as in `avtorch.diagnose`. Raises
         `InputError` for less than one step.
         """
-        if not asks_for_bar(progress):
-            return self._run(duration, events, called(progress))
-        begun = self.loop.time
-        with progress_bar("drive") as step:
-            return self._run(duration, events, lambda time: step(time - begun, duration))
-
-    def _run(
-        self,
-        duration: float,
-        events: Sequence[tuple[float, Callable[[ClosedLoop], None]]],
-        progress: Callable[[float], None] | None,
-    ) -> SupervisedRun:
-        loop, n = self.loop, self.loop.scenarios
+        step, loop, n, begun = called(progress), self.loop, self.loop.scenarios, self.loop.time
         if not 0.5 * loop.dt < duration < float("inf"):
             raise InputError(f"duration: found {duration:g} s, needs at least one step of {loop.dt:g} s")
         end = loop.steps_done + round(duration / loop.dt)
         pending = sorted(((round(t / loop.dt), change) for t, change in events), key=lambda event: event[0])
         blocks: list[Block] = []
         windows: list[WatchedWindow] = []
-        alerts: list[list[Alert]] = [[] for _ in range(n)]
         actions: list[list[Action]] = [[] for _ in range(n)]
         while loop.steps_done < end:
             for watched in self._unanswered:
@@ -164,26 +151,18 @@ class Supervisor:
             block = loop.advance(until - loop.steps_done)
             blocks.append(block)
             self._remember(block)
-            for watched in self._feed(block):
-                windows.append(watched)
-                self._note(watched, alerts)
-                # an alarm at the run's last step is acted on when the run continues
-                self._unanswered.append(watched)
-            if progress is not None:
-                progress(loop.time)
-        return SupervisedRun(Block.concatenate(blocks), windows, alerts, actions)
+            # an alarm at the run's last step is acted on when the run continues
+            self._unanswered = self._feed(block)
+            windows += self._unanswered
+            if step is not None:
+                step(loop.time - begun, duration)
+        return SupervisedRun(Block.concatenate(blocks), windows, actions)
 
     def _feed(self, block: Block) -> list[WatchedWindow]:
         columns = {"accel_cmd": block.accel_cmd, "accel": block.accel, "speed": block.speed, "jerk": block.jerk}
         # a crashed car's rows mean nothing; standstill is not GLVD
         usable = (block.speed >= STANDSTILL_MPS) & ~self.loop.collided[:, None]
         return self.watch.feed(block.time, columns, self.setting, usable=usable, until=self.loop.time)
-
-    def _note(self, watched: WatchedWindow, alerts: list[list[Alert]]) -> None:
-        report = watched.report
-        for i in torch.nonzero(report.any).squeeze(-1).tolist():
-            for name in report.names(i):
-                alerts[i].append(Alert(watched.window.end_s, name, report.why(name, i)))
 
     def _remember(self, block: Block) -> None:
         """Keep only the rows that the strategist replays."""
@@ -214,13 +193,14 @@ class Supervisor:
             default=self.default[asked],
             time_gap_now=gap_now[asked],
             model_wrong=self._model_wrong[asked],
-            accel_min=_of(lower.accel_min, asked),
-            accel_max=_of(lower.accel_max, asked),
+            accel_min=of_scenarios(lower.accel_min, asked),
+            accel_max=of_scenarios(lower.accel_max, asked),
         )
         changed = decision.changes
         where = torch.zeros(loop.scenarios, dtype=torch.bool).index_put((asked,), changed)
         if bool(changed.any()):
-            self._order(_scatter(self._ordered, asked, decision.setting))
+            new = decision.setting
+            self._order(self._ordered.map(lambda name, old: old.index_put((asked,), getattr(new, name))))
         truth = _truth(loop)
         for j, i in enumerate(asked.tolist()):
             if not bool(changed[j]):
@@ -250,20 +230,15 @@ class Supervisor:
         self._acted |= where
 
     def _verdict(self, watched: WatchedWindow) -> Tensor:
-        """P(stable) (scenario,) of the decided setting, which may be in force only once the driver has set the time
-        gap."""
-        report = watched.report
-        p = torch.minimum(report.p_string_stable, report.p_local_stable)
+        """P(string stable) (scenario,) of the decided setting, which may be in force only once the driver has set the
+        time gap."""
         waiting = self._due < _NEVER
         if not bool(waiting.any()):
-            return p
+            return watched.report.p_string_stable
         T_L, K_L = (watched.window.belief.draws[..., i].mT for i in range(2))
         dead_time = self.watch.monitor.dead_time
-        soon = torch.minimum(
-            self._ordered.p_string_stable(T_L, K_L, dead_time=dead_time, link_delay=self.loop.link_delay),
-            self._ordered.p_locally_stable(T_L, K_L, dead_time=dead_time),
-        )
-        return torch.where(waiting, soon, p)
+        soon = self._ordered.p_string_stable(T_L, K_L, dead_time=dead_time, link_delay=self.loop.link_delay)
+        return torch.where(waiting, soon, watched.report.p_string_stable)
 
     def _order(self, setting: Setting) -> None:
         """Put `setting` in force, but for the longer time gaps that a driver is asked for."""
@@ -327,14 +302,6 @@ def _time_gap_now(loop: ClosedLoop, setting: Setting) -> Tensor:
     return setting.time_gap if at is None else at(loop.time).expand(loop.scenarios)
 
 
-def _for_scenarios(setting: Setting, n: int) -> Setting:
-    """A given setting, (scenario,)."""
-    whole = setting.replace(scenarios=n)
-    if whole.shape != (n,):
-        raise InputError(f"setting: found shape {tuple(setting.shape)}, needs one or {n} scenarios")
-    return whole
-
-
 def _check_reach(strategist: Strategist, loop: ClosedLoop) -> None:
     """Refuse a strategist that may choose what the controller cannot do: the choice would be reported but not
     applied."""
@@ -355,14 +322,3 @@ def _check_reach(strategist: Strategist, loop: ClosedLoop) -> None:
         )
     if loop.scenarios > 1:
         raise InputError(f"scenarios: found {loop.scenarios}, but this controller has one time gap for all of them")
-
-
-def _of(value: float | Tensor, index: Tensor) -> float | Tensor:
-    return value[index] if isinstance(value, Tensor) and value.dim() else value
-
-
-def _scatter(setting: Setting, index: Tensor, new: Setting) -> Setting:
-    """`setting` with the scenarios `index` replaced by `new`."""
-    return setting.replace(
-        **{f.name: getattr(setting, f.name).index_put((index,), getattr(new, f.name)) for f in fields(Setting)}
-    )

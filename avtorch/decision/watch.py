@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
@@ -49,7 +50,7 @@ class Action:
 
 @dataclass(frozen=True, repr=False)
 class SupervisedRun(Displayed):
-    """A supervised run: `rows` (scenario, time), `windows`, and per scenario its `alerts` and `actions`.
+    """A supervised run: `rows` (scenario, time), `windows`, and per scenario its `actions`.
 
     Example:
         >>> from avtorch import BeliefStream, ClosedLoop, Leader, Supervisor
@@ -61,8 +62,15 @@ class SupervisedRun(Displayed):
 
     rows: Block
     windows: list[WatchedWindow]
-    alerts: list[list[Alert]]
     actions: list[list[Action]]
+
+    @cached_property
+    def alerts(self) -> list[list[Alert]]:
+        """Of each scenario, in the order of time."""
+        return [
+            [Alert(w.window.end_s, name, w.report.why(name, i)) for w in self.windows for name in w.report.names(i)]
+            for i in range(len(self.actions))
+        ]
 
     def overview(self) -> Card:
         """What was driven, what was seen and done in the first scenario, and the first scenarios in figures."""

@@ -4,7 +4,6 @@ batch. And its protocol of estimation: windows of 5 s at 100 Hz, three to form a
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -107,8 +106,7 @@ def ten_windows(
 
 def stacked(settings: list[Setting]) -> Setting:
     """Settings of shape (1,) as one of shape (setting,)."""
-    parts: dict[str, Any] = {name: torch.cat([getattr(s, name) for s in settings]) for name in vars(settings[0])}
-    return Setting(**parts)
+    return settings[0].map(lambda name, _: torch.cat([getattr(s, name) for s in settings]))
 
 
 def rows_from(run: Block, start: float, end: float | None = None) -> Block:

@@ -171,7 +171,7 @@ def monitoring(leaders: Leaders, *, seeds: int, seed: int, progress: Progress = 
         run = Supervisor(loop, window=WINDOW_S, seed=seed).run(
             DRIVE_S,
             events=[(CHANGE_S, change)],
-            progress=lambda s, i=i: progress((i + s / DRIVE_S) / count),
+            progress=lambda done, of, i=i: progress((i + done / of) / count),
         )
         found.append(_read(ahead, run))
     return Monitoring(found, seed)

@@ -24,8 +24,7 @@ from avtorch.paper.rows import MOST, ClaimRow, middle, sign, spread
 from avtorch.vehicle.stability import (
     local_conditions,
     local_stable,
-    p_locally_stable,
-    p_string_stable,
+    p_locally_and_string_stable,
     string_conditions,
     string_stable,
 )
@@ -200,7 +199,8 @@ def _believed(case: Panel, gains: Tensor, draws: Tensor) -> tuple[Tensor, Tensor
     """Locally and string stable with probability 0.95 or more, of `gains` (..., 3) under `draws` (draw, 2)."""
     gap = torch.full(gains.shape[:-1], case.time_gap, dtype=torch.float64)
     T, K = draws.unbind(-1)
-    return p_locally_stable(T, K, gap, gains) >= MOST, p_string_stable(T, K, gap, gains) >= MOST
+    local, string = p_locally_and_string_stable(T, K, gap, gains)
+    return local >= MOST, string >= MOST
 
 
 def _beliefs(ahead: Ahead, seeds: int, seed: int, progress: Progress) -> dict[float, Tensor]:

@@ -217,4 +217,4 @@ def supervise(
     plant = GLVDPlant(*HEALTHY, sigma=NOISE)
     loop = ClosedLoop(ahead.leader, plant=plant, scenarios=seeds, seeds=noise_seeds(seed, seeds))
     supervisor = Supervisor(loop, strategist=Strategist(Grid(allowed=ALLOWED[allowed])), seed=seed)
-    return supervisor.run(duration, events=[(CHANGE_S, change)], progress=lambda s: progress(s / duration))
+    return supervisor.run(duration, events=[(CHANGE_S, change)], progress=lambda done, of: progress(done / of))

@@ -11,7 +11,7 @@ Example:
 from avtorch.vehicle.black_box import Linearised, linearise, measured_gain
 from avtorch.vehicle.block import Block, Trajectory
 from avtorch.vehicle.controllers import NOMINAL_GAINS, RAMP_RATE, Controller, FollowerState, LinearController, TimeGap
-from avtorch.vehicle.glvd import GLVD, exact_motion, glvd_jerk, glvd_rollout, glvd_step
+from avtorch.vehicle.glvd import GLVD, glvd_jerk, glvd_rollout, glvd_step
 from avtorch.vehicle.leader import Leader
 from avtorch.vehicle.loop import ClosedLoop, simulate
 from avtorch.vehicle.lower_level import LowerLevel
@@ -41,7 +41,6 @@ __all__ = [
     "TimeGap",
     "Trajectory",
     "equilibrium_throughput",
-    "exact_motion",
     "glvd_jerk",
     "glvd_rollout",
     "glvd_step",

@@ -15,14 +15,14 @@ their parameters once. Everything broadcasts over leading dimensions and keeps t
 
 from __future__ import annotations
 
-from typing import Literal, cast
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from avtorch.arrays import Float, Real
 from avtorch.errors import InputError
-from avtorch.vehicle.arguments import Batched, Number, broadcast_shape, checked, tensor
+from avtorch.vehicle.arguments import Batched, Number, broadcast_shape, checked
 
 Method = Literal["zoh", "euler"]
 
@@ -126,33 +126,6 @@ def motion_coefficients(
     return torch.exp(-ratio), m1, torch.where(ratio < 0.02, series, T_L * (dt - m1))
 
 
-def exact_motion(
-    a: Float[Tensor, "*#batch"],
-    v: Float[Tensor, "*#batch"],
-    u: Float[Tensor, "*#batch"],
-    eps: Float[Tensor, "*#batch"],
-    dt: float,
-    T_L: Float[Tensor, "*#batch"],
-    K_L: Float[Tensor, "*#batch"],
-) -> tuple[Float[Tensor, "..."], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Exact integration of Eq. 1 over one step with command `u` and jerk noise `eps` held; all broadcast.
-
-    Args: `a` [m/s²], `v` [m/s], `u` [m/s²], `eps` [m/s³], `dt` [s], `T_L` [s], `K_L` [-].
-    Returns acceleration, speed and displacement [m] at the end of the step. The loop handles standstill.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.vehicle import exact_motion
-        >>> a, v, u, eps, T_L, K_L = torch.tensor([0.0, 20.0, 1.0, 0.0, 0.3, 1.0], dtype=torch.float64)
-        >>> [round(float(x), 4) for x in exact_motion(a, v, u, eps, 0.1, T_L, K_L)]
-        [0.2835, 20.015, 2.0005]
-    """
-    alpha, m1, m2 = motion_coefficients(tensor(T_L), dt)
-    a_inf = K_L * u + T_L * eps
-    d = a - a_inf
-    return a_inf + alpha * d, v + dt * a_inf + m1 * d, dt * v + (0.5 * dt * dt) * a_inf + m2 * d
-
-
 class GLVD(torch.nn.Module):
     """Eq. 1 as a differentiable module with parameters `T_L` [s] > 0 and `K_L` [-] >= 0 of any batch shape.
 
@@ -199,16 +172,4 @@ class GLVD(torch.nn.Module):
         """Accelerations at steps 1…N along the last dimension; see `glvd_rollout`."""
         return glvd_rollout(a0, u, self.T_L, self.K_L, dt, method=method)
 
-    def forward(
-        self, a0: Number, u: Real[Tensor, "*#batch time"], dt: Number, method: Method = "zoh"
-    ) -> Float[Tensor, "*all time"]:
-        """`rollout`."""
-        return self.rollout(a0, u, dt, method)
-
-    def extra_repr(self) -> str:
-        return f"T_L={_plain(self.T_L)}, K_L={_plain(self.K_L)}"
-
-
-def _plain(x: Tensor) -> object:
-    """Nested lists of numbers, or the number."""
-    return cast(object, x.tolist())  # pyright: ignore[reportUnknownMemberType]
+    forward = rollout

@@ -205,15 +205,12 @@ class ClosedLoop:
         eps = eps_all.unbind(0)
         x, v, a, dt = self._x, self._v, self._a, self.dt
         rows: list[tuple[Tensor, ...]] = []
-        held_rows: dict[int, Tensor] = {}
         standing = bool((v <= 0).any())
+        nowhere = torch.zeros_like(self._hit)
         for i in range(steps):
             lead_x, lead_v, lead_a = lead[0][i], lead[1][i], lead[2][i]
-            kinematic = a
-            if standing:
-                held = (v <= 0) & (a <= 0)
-                held_rows[i] = held
-                kinematic = torch.where(held, 0.0, a)
+            held = (v <= 0) & (a <= 0) if standing else nowhere
+            kinematic = torch.where(held, 0.0, a) if standing else a
             if self.vehicles is not None:
                 lead_x, lead_v = self._in_front(lead_x, x), self._in_front(lead_v, v)
                 lead_a = self._in_front(lead_a, kinematic)
@@ -224,13 +221,13 @@ class ClosedLoop:
             demanded = self.controller(FollowerState(time, spacing, shown, kinematic, lead_v, seen))
             raw = lower.raw_command(kinematic, demanded)
             command = lower.clip(raw)
-            rows.append((command, kinematic, shown, spacing, lead_v, lead_a, demanded, raw, a))
+            rows.append((command, kinematic, shown, spacing, lead_v, lead_a, demanded, raw, a, held))
             a, v_next, moved = move(a, v, command, dt, eps[i])
             stood, standing = standing, float(v_next.min()) <= 0
             if stood or standing:
                 v_next, moved = _stop(v, v_next, moved, dt)
             x, v = x + moved, v_next
-        block = self._block(rows, held_rows, eps_all, first)
+        block = self._block(rows, eps_all, first)
         self._x, self._v, self._a = x, v, a
         self.steps_done += steps
         return block
@@ -243,7 +240,7 @@ class ClosedLoop:
         self._link.append(lead_accel)
         return self._link.pop(0) if len(self._link) > self._link_steps else self._link[0]
 
-    def _block(self, rows: list[tuple[Tensor, ...]], held_rows: dict[int, Tensor], eps: Tensor, first: int) -> Block:
+    def _block(self, rows: list[tuple[Tensor, ...]], eps: Tensor, first: int) -> Block:
         shape = self._v.shape
 
         def series(column: int) -> Tensor:
@@ -252,16 +249,14 @@ class ClosedLoop:
                 values = [value.expand(shape) for value in values]
             return torch.stack(values, -1)
 
-        command, kinematic, speed, spacing, lead_v, lead_a, demanded, raw, actuator = (series(i) for i in range(9))
+        command, kinematic, speed, spacing, lead_v, lead_a, demanded, raw, actuator, held = (
+            series(i) for i in range(10)
+        )
         if not bool(torch.isfinite(demanded).all()):
             row = int(torch.nonzero(~torch.isfinite(demanded.reshape(-1, len(rows))).all(0))[0])
             raise InputError(f"controller: demanded a value that is not finite at {(first + row) * self.dt:g} s")
         self._hit = self._hit | (spacing <= 0).any(-1)
-        jerk = self._jerk(actuator, command, eps)
-        if held_rows:
-            none = torch.zeros(shape, dtype=torch.bool)
-            held = torch.stack([held_rows.get(i, none).expand(shape) for i in range(len(rows))], -1)
-            jerk = torch.where(held, 0.0, jerk)
+        jerk = torch.where(held, 0.0, self._jerk(actuator, command, eps))
         time = torch.arange(first, first + len(rows), dtype=torch.float64) * self.dt
         # time first, so that limits (scenario,) stay on the last dimension
         limited = self.lower_level.at_limit(command.movedim(-1, 0)).movedim(0, -1)

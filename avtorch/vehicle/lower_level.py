@@ -45,8 +45,7 @@ class LowerLevel:
     accel_max: Number = 4.0
     _on_accel: Tensor = field(init=False, repr=False, compare=False)
     _on_demand: Tensor = field(init=False, repr=False, compare=False)
-    _inverts: bool = field(init=False, repr=False, compare=False)
-    _limits: tuple[float, float] | tuple[Tensor, Tensor] = field(init=False, repr=False, compare=False)
+    _limits: tuple[Tensor, Tensor] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         T_hat = checked("T_hat", self.T_hat, unit="s", above=0.0)
@@ -58,23 +57,17 @@ class LowerLevel:
             raise InputError(f"accel_min: found {self.accel_min} with accel_max {self.accel_max}, needs a lower value")
         # written so that T_hat = T_d, K_hat = K_d gives exactly 0 and 1: u passes through unchanged
         on_accel, on_demand = (1 - T_hat / T_d) / K_hat, (T_hat * K_d) / (K_hat * T_d)
-        both_floats = not isinstance(self.accel_min, Tensor) and not isinstance(self.accel_max, Tensor)
-        limits = (float(self.accel_min), float(self.accel_max)) if both_floats else (low, high)
         object.__setattr__(self, "_on_accel", on_accel)
         object.__setattr__(self, "_on_demand", on_demand)
-        object.__setattr__(self, "_inverts", bool((on_accel != 0).any() or (on_demand != 1).any()))
-        object.__setattr__(self, "_limits", limits)
+        object.__setattr__(self, "_limits", (low, high))
 
     def raw_command(self, a: Float[Tensor, "*#batch"], u: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
         """The command before clipping [m/s²] for measured acceleration `a` and demand `u` [m/s²], (..., scenario)."""
-        if not self._inverts:
-            return u
         return torch.addcmul(self._on_accel * a, self._on_demand, u)
 
     def clip(self, raw: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
         """`raw` [m/s²] within the vehicle's limits."""
-        # torch takes two floats or two tensors, and its types ask for one of the two by itself
-        return torch.clamp(raw, *self._limits)  # pyright: ignore[reportCallIssue, reportArgumentType, reportUnknownVariableType]
+        return torch.clamp(raw, *self._limits)
 
     def at_limit(self, command: Float[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
         """Where a command is at the vehicle's limits, clipped here or limited by the controller (an MPC), bool."""

@@ -11,17 +11,17 @@ demands the first move. The states are eliminated (condensed form), which leaves
 Where the unconstrained optimum `-H⁻¹ F x` lies inside the box it is the solution. Elsewhere: the primal-dual active set
 method (a semismooth Newton method; Hintermüller, Ito and Kunisch 2002), which ends after a few solves at the exact
 optimum and, started afresh each tick, gives a scenario the same result in any batch. It can cycle in theory; problems
-not settled after 20 rounds are solved by Nesterov's projected gradient method, whose rate `1 - 1/sqrt(cond)` fixes the
-number of iterations beforehand. Library solvers are not used, because they take one problem at a time.
+not settled after 20 rounds go to SciPy's bounded least squares, which takes one problem at a time.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
-from typing import cast
+from collections.abc import Callable, Sequence
+from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -31,7 +31,6 @@ from avtorch.vehicle.arguments import broadcast, checked
 from avtorch.vehicle.controllers import RAMP_RATE, FollowerState, TimeGap
 
 _ROUNDS = 20  # of the active set method; 3 to 6 are usual
-_ACCURACY = 1e-9  # relative error of the gradient iterations, by their guaranteed rate
 
 
 class MPC:
@@ -52,7 +51,7 @@ class MPC:
     Example:
         >>> from avtorch import MPC, stability
         >>> mpc = MPC(time_gap=1.6)
-        >>> bool(stability.string_stable(T_L=0.3, K_L=1.0, time_gap=1.6, gains=mpc.equivalent_gains()))
+        >>> bool(stability.string_stable(T_L=0.3, K_L=1.0, time_gap=1.6, gains=mpc.gains))
         True
     """
 
@@ -83,11 +82,12 @@ class MPC:
         if q.shape != (4,) or float(q[3]) <= 0:
             raise InputError(f"weights: found {tuple(weights)!r}, needs q_s, q_v, q_a >= 0 and r > 0")
         self.accel_min, self.accel_max = float(accel_min), float(accel_max)
-        self.T_hat, self.K_hat, self.horizon, self.weights = lag, gain, horizon, tuple(float(x) for x in q)
+        self.T_hat, self.K_hat, self.moves, self.weights = lag, gain, moves, q
         self.ramp: TimeGap | None = None
-        self._condense(moves, q)
+        self._condense()
 
-    def _condense(self, moves: int, q: Float[Tensor, "4"]) -> None:
+    def _condense(self) -> None:
+        moves, q = self.moves, self.weights
         tau, T, K, h = self.time_gap, self.T_hat, self.K_hat, self.step
         drift = torch.tensor([[0, 1, -tau, 0], [0, 0, -1, 0], [0, 0, -1 / T, K / T], [0, 0, 0, 0]], dtype=torch.float64)
         held = torch.matrix_exp(drift * h)
@@ -105,15 +105,6 @@ class MPC:
         self._H = 2 * (torch.einsum("jsi,jsk->ik", forced, weight * forced) + q[3] * torch.eye(moves, dtype=q.dtype))
         self._F = 2 * torch.einsum("jsi,jsk->ik", forced, weight * free)  # (move, 3)
         self._law = -_solved(self._H, self._F)
-        scale = self._H.diagonal().rsqrt()
-        self._scale, self._scaled_H = scale, scale[:, None] * self._H * scale
-        # torch.linalg has no types
-        eigenvalues = cast(Tensor, torch.linalg.eigvalsh(self._scaled_H))  # pyright: ignore[reportUnknownMemberType]
-        self._lipschitz = float(eigenvalues[-1])
-        root = math.sqrt(self._lipschitz / float(eigenvalues[0]))
-        self._momentum = (root - 1) / (root + 1)
-        # the squared error falls by 1 - 1/root an iteration
-        self._iterations = max(1, math.ceil(2 * math.log(_ACCURACY) / math.log1p(-1 / root))) if root > 1 else 1
 
     def __call__(self, state: FollowerState) -> Float[Tensor, "*scenario"]:
         gap = self.time_gap
@@ -154,24 +145,22 @@ class MPC:
             moved = ((above != was[0]) | (below != was[1])).any(-1)
             if not bool(moved.any()):
                 return out
-        return torch.where(moved.unsqueeze(-1), self._descend(linear, guess), out)
+        out[moved] = self._one_by_one(linear[moved])
+        return out
 
-    def _descend(
-        self, linear: Float[Tensor, "problem move"], guess: Float[Tensor, "problem move"]
-    ) -> Float[Tensor, "problem move"]:
-        """The same by projected gradient with constant momentum, in variables `U / scale` of unit diagonal."""
-        low, high = self.accel_min / self._scale, self.accel_max / self._scale
-        step = 1 / self._lipschitz
-        shift = -step * linear * self._scale
-        turn = torch.eye(len(self._scale), dtype=linear.dtype) - step * self._scaled_H
-        old = ahead = torch.clamp(guess / self._scale, low, high)
-        for _ in range(self._iterations):
-            new = torch.clamp(ahead @ turn + shift, low, high)
-            ahead = new + self._momentum * (new - old)
-            old = new
-        return old * self._scale
+    def _one_by_one(self, linear: Float[Tensor, "problem move"]) -> Float[Tensor, "problem move"]:
+        """The same by bounded least squares, one problem after the other."""
+        # imported here, because it takes longer than all of this package and is hardly ever needed
+        from scipy.optimize import lsq_linear  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
-    def equivalent_gains(self) -> tuple[float, float, float]:
+        root = np.linalg.cholesky(self._H.numpy())
+        targets = -np.linalg.solve(root, linear.numpy().T).T
+        box = (self.accel_min, self.accel_max)
+        solve = cast(Callable[..., Any], lsq_linear)
+        return torch.as_tensor(np.stack([solve(root.T, b, box, method="bvls").x for b in targets]))
+
+    @property
+    def gains(self) -> tuple[float, float, float]:
         """`(k_s, k_v, k_a)` of the MPC away from the limits, where it is linear: `u = k_s Δs + k_v Δv + k_a a`.
 
         With these the stability analysis of the linear controller holds for the MPC (small motions).
@@ -179,33 +168,18 @@ class MPC:
         k_s, k_v, k_a = (float(x) for x in self._law[0])
         return k_s, k_v, k_a
 
-    @property
-    def gains(self) -> tuple[float, float, float]:
-        """`equivalent_gains`."""
-        return self.equivalent_gains()
-
     def time_gap_at(self, time: float) -> Float[Tensor, "*setting"]:
         """The time gap [s] in force at `time` [s]."""
         return checked("time_gap", self.time_gap) if self.ramp is None else self.ramp.at(time)
 
-    def retargeted(self, *, at: float, time_gap: float | None = None, rate: float = RAMP_RATE) -> MPC:
+    def retargeted(self, *, at: float, time_gap: float, rate: float = RAMP_RATE) -> MPC:
         """The same MPC with a new time gap from `at` [s] on, reached at `rate` [s/s]; see `LinearController`.
 
         The prediction uses the new gap at once, the error `Δs` the one in force.
         """
-        if time_gap is None:
-            return copy.copy(self)
-        new = MPC(
-            time_gap=time_gap,
-            standstill=self.standstill,
-            horizon=self.horizon,
-            step=self.step,
-            T_hat=self.T_hat,
-            K_hat=self.K_hat,
-            accel_min=self.accel_min,
-            accel_max=self.accel_max,
-            weights=self.weights,
-        )
+        new = copy.copy(self)
+        new.time_gap = time_gap
+        new._condense()
         new.ramp = TimeGap(target=time_gap, start=self.time_gap_at(at), since=at, rate=rate)
         return new
 

@@ -62,12 +62,10 @@ class Performance:
         return out
 
 
-def performance(
-    run: Block, *, time_gap: Number | None = None, standstill: Number = 5.0, length: float = VEHICLE_LENGTH_M
-) -> Performance:
+def performance(run: Block, *, time_gap: Number | None = None, standstill: Number = 5.0) -> Performance:
     """Compute the measures of a `Block` or `Trajectory` (..., time).
 
-    `time_gap` [s] is that of the setting, for the throughput; `standstill` and `length` of a vehicle [m]. The peak gain
+    `time_gap` [s] is that of the setting, for the throughput; `standstill` [m] likewise. The peak gain
     belongs to a setting, not to a run: `avtorch.stability.peak_gain`.
 
     Example:
@@ -86,7 +84,7 @@ def performance(
     mean = lead_v.mean(-1)
     flow = torch.full_like(mean, math.nan)
     if time_gap is not None:
-        flow = equilibrium_throughput(mean, time_gap, standstill=standstill, length=length).expand(mean.shape)
+        flow = equilibrium_throughput(mean, time_gap, standstill=standstill).expand(mean.shape)
     calm = (a.abs() <= COMFORT_ACCEL) & (run.jerk.abs() <= COMFORT_JERK)
     return Performance(
         speed_rms_ratio=_rms(v - v.mean(-1, keepdim=True)) / _moving(_rms(lead_v - lead_v.mean(-1, keepdim=True))),
@@ -102,15 +100,13 @@ def performance(
     )
 
 
-def equilibrium_throughput(
-    speed: Batched, time_gap: Batched, *, standstill: Batched = 5.0, length: float = VEHICLE_LENGTH_M
-) -> Float[Tensor, "*batch"]:
+def equilibrium_throughput(speed: Batched, time_gap: Batched, *, standstill: Batched = 5.0) -> Float[Tensor, "*batch"]:
     """Vehicles an hour past a point when all drive at `speed` [m/s] and `time_gap` [s]; arguments broadcast.
 
-    `3600 v / (time_gap v + standstill + length)`. Raises `InputError` for negative values.
+    `3600 v / (time_gap v + standstill + 4.5 m)`. Raises `InputError` for negative values.
     """
     v, gap = checked("speed", speed, unit="m/s", least=0.0), checked("time_gap", time_gap, unit="s", least=0.0)
-    return 3600 * v / (gap * v + tensor(standstill) + length)
+    return 3600 * v / (gap * v + tensor(standstill) + VEHICLE_LENGTH_M)
 
 
 def _rms(x: Tensor) -> Tensor:

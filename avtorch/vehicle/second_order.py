@@ -25,26 +25,6 @@ from avtorch.vehicle.arguments import Number, broadcast, checked
 from avtorch.vehicle.glvd import glvd_rollout
 
 
-def speed_lag_accel(
-    v: Float[Tensor, "*#batch"],
-    v_cmd: Float[Tensor, "*#batch"],
-    T_V: Float[Tensor, "*#batch"],
-    K_V: Float[Tensor, "*#batch"],
-) -> Float[Tensor, "*batch"]:
-    """Noise-free acceleration ``(K_V v_cmd - v)/T_V`` [m/s²] of speeds [m/s]; all broadcast."""
-    return (K_V * v_cmd - v) / T_V
-
-
-def position_lag_accel(
-    error: Float[Tensor, "*#batch"],
-    v: Float[Tensor, "*#batch"],
-    T_P: Float[Tensor, "*#batch"],
-    zeta: Float[Tensor, "*#batch"],
-) -> Float[Tensor, "*batch"]:
-    """Noise-free acceleration ``error/T_P² - 2 zeta v/T_P`` [m/s²], ``error = x_cmd - x`` [m]; all broadcast."""
-    return error / T_P**2 - 2 * zeta / T_P * v
-
-
 class SpeedLag(torch.nn.Module):
     """A first-order lag between commanded and realised speed, with parameters ``T_V`` [s] > 0, ``K_V`` [-] >= 0.
 
@@ -65,10 +45,6 @@ class SpeedLag(torch.nn.Module):
         self.T_V = torch.nn.Parameter(checked("T_V", T_V, unit="s", above=0.0).detach().clone())
         self.K_V = torch.nn.Parameter(checked("K_V", K_V, least=0.0).detach().clone())
 
-    def accel(self, v: Float[Tensor, "*#batch"], v_cmd: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
-        """See :func:`speed_lag_accel`."""
-        return speed_lag_accel(v, v_cmd, self.T_V, self.K_V)
-
     def rollout(self, v0: Number, v_cmd: Real[Tensor, "*#batch time"], dt: float) -> Float[Tensor, "*all time"]:
         """Speeds at steps 1…N under commands ``(..., time)``, each held for ``dt`` [s]; exact, ``(..., time)``.
 
@@ -76,9 +52,7 @@ class SpeedLag(torch.nn.Module):
         """
         return glvd_rollout(v0, v_cmd, self.T_V, self.K_V, dt)
 
-    def forward(self, v0: Number, v_cmd: Real[Tensor, "*#batch time"], dt: float) -> Float[Tensor, "*all time"]:
-        """`rollout`."""
-        return self.rollout(v0, v_cmd, dt)
+    forward = rollout
 
 
 class PositionLag(torch.nn.Module):
@@ -100,10 +74,6 @@ class PositionLag(torch.nn.Module):
         super().__init__()
         self.T_P = torch.nn.Parameter(checked("T_P", T_P, unit="s", above=0.0).detach().clone())
         self.zeta = torch.nn.Parameter(checked("zeta", zeta, least=0.0).detach().clone())
-
-    def accel(self, error: Float[Tensor, "*#batch"], v: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
-        """See :func:`position_lag_accel`."""
-        return position_lag_accel(error, v, self.T_P, self.zeta)
 
     def rollout(
         self,
@@ -134,12 +104,4 @@ class PositionLag(torch.nn.Module):
         x, v = torch.stack(out, -2).unbind(-1)
         return x, v
 
-    def forward(
-        self,
-        x0: Float[Tensor, "*#batch"],
-        v0: Float[Tensor, "*#batch"],
-        x_cmd: Float[Tensor, "*#batch time"],
-        dt: float,
-    ) -> tuple[Float[Tensor, "*all time"], Float[Tensor, "*all time"]]:
-        """`rollout`."""
-        return self.rollout(x0, v0, x_cmd, dt)
+    forward = rollout

@@ -14,7 +14,6 @@ from benchmarks.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, Family,
 from benchmarks.blindtest.deck import KINDS, MIX
 from benchmarks.blindtest.drives import DURATIONS_S, MANOEUVRES, RATES_HZ, DrivePlan, Recorded, draw_drive
 from benchmarks.blindtest.in_front import IN_FRONT, put_in_front
-from benchmarks.blindtest.in_front_score import Injected, score_in_front
 from benchmarks.blindtest.recorder import Recorder, draw_recorder
 from benchmarks.blindtest.score import score
 from benchmarks.blindtest.vehicle import Run, simulate
@@ -35,7 +34,6 @@ __all__ = [
     "Case",
     "DrivePlan",
     "Family",
-    "Injected",
     "Oracle",
     "Recorded",
     "Recorder",
@@ -49,7 +47,6 @@ __all__ = [
     "family",
     "put_in_front",
     "score",
-    "score_in_front",
     "sight",
     "simulate",
     "tier_of",

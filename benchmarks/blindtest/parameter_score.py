@@ -11,7 +11,52 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from benchmarks.blindtest.answers import Answered
-from benchmarks.blindtest.in_front_score import SIZE_OF, SIZE_WITHIN
+
+SIZE_WITHIN = 0.25
+"""A size is right within this share of what was put in."""
+
+
+def _sum(found: float, before: float, put_in: float) -> float | None:
+    return (found - before) / put_in
+
+
+def _ratio(found: float, before: float, put_in: float) -> float | None:
+    """Factors multiply: compared as logarithms, so that a gain of 0.65 is as far from 1 as one of 1/0.65."""
+    return math.log(found / before) / math.log(put_in) if min(found, before) > 0 else None
+
+
+def _squares(found: float, before: float, put_in: float) -> float | None:
+    """Independent disturbances add in squares."""
+    return math.sqrt(max(found**2 - before**2, 0.0)) / put_in
+
+
+def _stricter(found: float, before: float, put_in: float) -> float | None:
+    """Of two limits only the stricter one is seen."""
+    return found / min(before, put_in)
+
+
+SIZE_OF: Mapping[str, tuple[str, float, Callable[[float, float, float], float | None]]] = {
+    "dead_time": ("delay_s", 0.0, _sum),
+    "dead_band": ("half_width_mps2", 0.0, _sum),
+    "backlash": ("half_width_mps2", 0.0, _sum),
+    "brake_throttle_asymmetry": ("brake_gain_ratio", 1.0, _ratio),
+    "gain_change": ("gain_ratio", 1.0, _ratio),
+    "speed_dependent_gain": ("gain_slope", 0.0, _sum),
+    "saturation": ("accel_max_mps2", math.inf, _stricter),
+    "constant_resistance": ("resistance_mps2", 0.0, _sum),
+    "aerodynamic_drag": ("drag_per_m", 0.0, _sum),
+    "road_grade": ("grade_rms", 0.0, _squares),
+    "low_speed_creep": ("creep_mps2", 0.0, _sum),
+    "gust": ("sd_mps2", 0.0, _squares),
+    "sensor_bias": ("bias_mps2", 0.0, _sum),
+    "sensor_scale": ("scale", 1.0, _ratio),
+    "sensor_lag": ("lag_s", 0.0, _sum),
+    "outliers": ("fraction", 0.0, _sum),
+}
+"""By effect: the parameter that is its size, its value without the effect, and how a second one adds to a first.
+
+A diagnosis gives the size of outliers in units of a noise that nobody knows, so their share is compared instead.
+"""
 
 _OTHERWISE: frozenset[str] = frozenset({"speed_dependent_gain", "road_grade", "low_speed_creep"})
 """Whose size can be put in front of a log, but means something else in the reference vehicle.

@@ -14,11 +14,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.decision.charts import CHARTS, Chart, ChartKind, chart_limit
+from avtorch.decision.charts import CHARTS, WEIGHT, Chart, ChartKind, chart_limit
 from avtorch.decision.divergence import DIVERGENCES, Gaussian, divergence_p_value, innovation
 from benchmarks.detectors.drives import Beliefs
 
-EWMA_WEIGHT = 0.2
 _RATES = tuple(10.0**-k for k in (1, 1.5, 2, 2.5, 3, 3.5, 4, 5, 6, 8, 10, 15, 20, 30, 40))
 _ARLS = (20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 3e4, 1e5, 1e6, 1e7, 1e8)
 
@@ -36,8 +35,8 @@ class Detector:
 
 
 def _chart(kind: ChartKind) -> Callable[[float], float]:
-    factor = math.sqrt(EWMA_WEIGHT / (2.0 - EWMA_WEIGHT)) if kind == "ewma" else 1.0
-    return lambda arl: factor * chart_limit(kind, 2.0 * arl, weight=EWMA_WEIGHT)
+    factor = math.sqrt(WEIGHT / (2.0 - WEIGHT)) if kind == "ewma" else 1.0
+    return lambda arl: factor * chart_limit(kind, 2.0 * arl)
 
 
 DETECTORS: dict[str, Detector] = {
@@ -63,7 +62,7 @@ def scores(beliefs: Beliefs, unevenness: tuple[float, float] = (0.0, 0.0)) -> di
     """
     windows, runs = beliefs.used.shape
     spread = beliefs.belief.cov + torch.diag(torch.tensor(unevenness, dtype=torch.float64) ** 2)
-    charts = {kind: Chart(kind, runs, weight=EWMA_WEIGHT) for kind in CHARTS}
+    charts = {kind: Chart(kind, runs) for kind in CHARTS}
     for chart in charts.values():
         chart.edge = math.inf  # never restarted
     baseline = Gaussian(beliefs.belief.mean[0], spread[0])

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from avtorch.decision.charts import CHARTS, Chart, chart_limit, cusum_arl, ewma_arl, shewhart_arl
+from avtorch.decision.charts import ALLOWANCE, CHARTS, WEIGHT, Chart, chart_limit, cusum_arl, ewma_arl, shewhart_arl
 from avtorch.errors import InputError
 from tests.bars import BAR
 
@@ -48,13 +48,14 @@ def test_two_components_alarm_once_per_arl(rotating_seed, draws_factor):
 def test_shewhart_is_exact_and_ewma_of_weight_one_is_shewhart():
     limit = chart_limit("shewhart", 370.0)
     assert math.erfc(limit / math.sqrt(2.0)) == pytest.approx(1.0 / 370.0, rel=1e-12)
-    assert ewma_arl(limit, 1.0) == shewhart_arl(limit) == pytest.approx(370.0, rel=1e-12)
+    assert shewhart_arl(limit) == pytest.approx(370.0, rel=1e-12)
+    assert ewma_arl(limit, 1.0) == pytest.approx(370.0, rel=1e-9)
     assert ewma_arl(limit, 0.999) == pytest.approx(370.0, rel=0.01)
 
 
 def test_limits_solve_their_own_equation():
-    assert ewma_arl(chart_limit("ewma", 500.0, weight=0.1), 0.1) == pytest.approx(500.0, rel=1e-6)
-    assert cusum_arl(chart_limit("cusum", 500.0, reference=0.25), 0.25) == pytest.approx(500.0, rel=1e-6)
+    assert ewma_arl(chart_limit("ewma", 500.0), WEIGHT) == pytest.approx(500.0, rel=1e-6)
+    assert cusum_arl(chart_limit("cusum", 500.0), ALLOWANCE) == pytest.approx(500.0, rel=1e-6)
 
 
 def test_a_cusum_of_no_height_is_two_one_sided_shewhart_arms():
@@ -91,17 +92,7 @@ def test_unseen_windows_move_nothing_and_a_state_resumes_to_the_bit(kind, fresh_
             assert torch.equal(part.last_statistic, whole.last_statistic)
 
 
-@pytest.mark.parametrize(
-    ("kind", "arl", "options"),
-    [
-        ("shewhart", 1.0, {}),
-        ("shewhart", float("nan"), {}),
-        ("ewma", 100.0, {"weight": 0.0}),
-        ("ewma", 100.0, {"weight": 1.5}),
-        ("cusum", 100.0, {"reference": 0.0}),
-        ("guess", 100.0, {}),
-    ],
-)
-def test_bad_designs_are_refused(kind, arl, options):
+@pytest.mark.parametrize(("kind", "arl"), [("shewhart", 1.0), ("shewhart", float("nan")), ("cusum", 1.1)])
+def test_bad_designs_are_refused(kind, arl):
     with pytest.raises(InputError, match="found"):
-        chart_limit(kind, arl, **options)
+        chart_limit(kind, arl)

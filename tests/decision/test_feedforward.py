@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from avtorch.decision import Grid, History, Monitor, Setting, Strategist, Supervisor
+from avtorch.decision.grid import intrusiveness
 from avtorch.errors import InputError
 from avtorch.vehicle import MPC, ClosedLoop, GLVDPlant, Leader, LinearController, LowerLevel, stability
 
@@ -41,10 +42,9 @@ def test_the_verdict_counts_gain_and_delay():
 def test_it_is_a_strategy_of_its_own_with_a_stated_cost():
     assert Setting(feedforward=0.5).strategies(Setting()) == [{4}]
     assert Setting(feedforward=0.5, time_gap=1.6).strategies(Setting()) == [{2, 4}]
-    price = Grid().intrusiveness
-    cost = price(Setting(feedforward=torch.tensor([0.0, 0.5, 1.0])), Setting(), torch.tensor([False]))
+    cost = intrusiveness(Setting(feedforward=torch.tensor([0.0, 0.5, 1.0])), Setting(), torch.tensor([False]))
     assert cost.tolist() == pytest.approx([0.0, 2.0, 2.5])
-    longer = price(Setting(time_gap=1.6), Setting(), torch.tensor([False]))
+    longer = intrusiveness(Setting(time_gap=1.6), Setting(), torch.tensor([False]))
     assert float(cost.max()) < float(longer)
 
 

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from avtorch.decision.grid import GAINS_GRID, Grid, Intrusiveness
+from avtorch.decision.grid import GAINS_GRID, Grid, intrusiveness
 from avtorch.decision.settings import Setting
 from avtorch.errors import InputError
 
@@ -56,10 +56,8 @@ def test_only_what_is_allowed(allowed, count):
 
 
 def test_the_stated_costs():
-    price = Intrusiveness()
-
     def cost(stale=False, **setting):
-        return float(price(Setting(**setting), Setting(), torch.tensor([stale])))
+        return float(intrusiveness(Setting(**setting), Setting(), torch.tensor([stale])))
 
     assert cost() == 0.0
     assert cost(stale=True) == 3.0
@@ -90,7 +88,7 @@ def test_what_is_in_force_comes_first_and_anything_else_costs_the_switch():
     assert setting.as_dict(0) == current.as_dict()
     # Gap and gains may go back to the default; the lower level stays.
     assert setting.shape[0] == 4
-    price = Intrusiveness()(setting, Setting(), torch.zeros(4, dtype=torch.bool))
+    price = intrusiveness(setting, Setting(), torch.zeros(4, dtype=torch.bool))
     assert (cost - price).tolist() == pytest.approx([0.0, 1.0, 1.0, 1.0])
 
 

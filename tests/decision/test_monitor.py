@@ -143,13 +143,6 @@ def test_rates_of_false_alarm_in_control(name, rotating_seed, draws_factor):
         assert abs(float(share.mean()) - rate) < BAR * float(share.std()) / math.sqrt(n) + 0.1 * rate
 
 
-def test_inflation_quiets():
-    for inflation, alarmed in ((1.0, True), (4.0, False)):
-        monitor = Monitor(1, detectors=["kl"], inflation=inflation)
-        monitor.update(*cloud([0.3], [1.0], sd=0.05), yes(), Setting())
-        assert bool(monitor.update(*cloud([0.4], [1.0], sd=0.05), yes(), Setting()).any[0]) is alarmed
-
-
 def test_a_vehicle_that_swings_by_a_few_per_cent_is_quiet_only_where_it_may():
     """A gain that swings by 2 % with a belief ten times as narrow: an alarm unless unevenness is allowed for."""
     for unevenness, alarmed in (((0.0, 0.0), True), ((0.1, 0.03), False)):
@@ -178,7 +171,6 @@ def test_dead_time_counts_in_the_stability_verdict():
         {"stability_level": 0.0},
         {"false_alarm_rate": 2.0},
         {"change": (0.2, 0.0)},
-        {"inflation": 0.5},
         {"unevenness": (0.1, -0.1)},
         {"scenarios": 0},
         {"detectors": ["ewma"], "arl": 0.5},

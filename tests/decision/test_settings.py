@@ -20,7 +20,8 @@ def test_verdicts_use_the_effective_actuation_of_every_draw(fresh_seed):
         time_gap=torch.tensor([1.0, 1.6, 2.5]),
         gains=torch.tensor([[1.5, 1.5, -0.8], [3.0, 3.0, -1.8], [1.5, 2.0, -0.8]]),
     )
-    string, local = setting.p_string_stable(T, K), setting.p_locally_stable(T, K)
+    local, string = setting.p_locally_and_string_stable(T, K)
+    assert torch.equal(string, setting.p_string_stable(T, K))
     for i in range(3):
         one = setting.as_dict(i)
         T_e, K_e = LowerLevel(one["T_hat"], one["K_hat"]).effective(T[i], K[i])

@@ -32,7 +32,7 @@ def becomes(T, K):
 
 
 def mpc_gains(gap):
-    return MPC(time_gap=gap).equivalent_gains()
+    return MPC(time_gap=gap).gains
 
 
 def mpc_strategist(**more):
@@ -356,7 +356,7 @@ def test_the_setting_is_read_off_the_loop():
     assert supervisor.watch.monitor.accepted[0].tolist() == pytest.approx([0.3, 1.5])
     assert supervisor.watch.monitor.accepted[1].tolist() == pytest.approx([0.9, 0.9])
     mpc = MPC(time_gap=1.3)
-    assert read_setting(make_loop(2, controller=mpc)).gains.tolist() == [list(mpc.equivalent_gains())] * 2
+    assert read_setting(make_loop(2, controller=mpc)).gains.tolist() == [list(mpc.gains)] * 2
     assert read_setting(make_loop(controller=mpc)).time_gap.tolist() == [1.3]
 
 
@@ -482,8 +482,8 @@ def test_a_plant_without_jerk_is_estimated_by_the_latent_form():
 
 def test_progress_is_reported_window_by_window():
     seen = []
-    Supervisor(make_loop()).run(5.0, progress=seen.append)
-    assert seen == pytest.approx([2.0, 4.0, 5.0])
+    Supervisor(make_loop()).run(5.0, progress=lambda done, of: seen.append((done, of)))
+    assert seen == [pytest.approx((done, 5.0)) for done in (2.0, 4.0, 5.0)]
 
 
 def test_one_action_uses_the_monitors_dead_time():

@@ -28,7 +28,7 @@ def test_slopes_of_a_linear_law_are_its_gains() -> None:
     assert law.feedforward == pytest.approx(0.4, abs=1e-8)
     assert law.bend < 1e-8
     mpc = MPC(time_gap=1.4)
-    assert linearise(mpc, 22.0).gains == pytest.approx(mpc.equivalent_gains(), rel=1e-6)
+    assert linearise(mpc, 22.0).gains == pytest.approx(mpc.gains, rel=1e-6)
     assert linearise(mpc, 22.0).time_gap == pytest.approx(1.4, rel=1e-6)
 
 

@@ -17,7 +17,7 @@ F64 = torch.float64
 
 def independent(mpc: MPC, x: np.ndarray) -> np.ndarray:
     """The same problem posed anew: states stepped by fine substeps, cost as stacked least squares."""
-    moves, fine = round(mpc.horizon / mpc.step), 400
+    moves, fine = mpc.moves, 400
     h = mpc.step / fine
 
     def residuals(u: np.ndarray) -> np.ndarray:
@@ -62,10 +62,10 @@ def test_plan_against_an_independent_solver():
 def test_both_solvers_and_the_optimality_conditions_agree(fresh_seed):
     mpc = MPC()
     x = torch.randn(400, 3, dtype=F64, generator=torch.Generator().manual_seed(fresh_seed)) * torch.tensor([20.0, 5, 2])
-    linear, free = x @ mpc._F.T, x @ mpc._law.T
+    linear = x @ mpc._F.T
     plan = mpc.plan(x)
     scale = linear.abs().amax(-1, keepdim=True)
-    torch.testing.assert_close(plan, mpc._descend(linear, free).clamp(-6, 4), rtol=0, atol=1e-6)
+    torch.testing.assert_close(plan, mpc._one_by_one(linear), rtol=0, atol=1e-6)
     slope = (plan @ mpc._H + linear) / scale
     assert (slope[(plan > -6) & (plan < 4)].abs() < 1e-9).all()
     assert (slope[plan == -6] > -1e-9).all()
@@ -83,7 +83,7 @@ def test_equivalent_gains_are_the_differences_of_the_law():
         return mpc(FollowerState(time=0.0, lead_accel=torch.zeros(1, dtype=F64), **tensors)).item()
 
     h = 1e-3
-    k_s, k_v, k_a = mpc.equivalent_gains()
+    k_s, k_v, k_a = mpc.gains
     assert (law(spacing=h) - law(spacing=-h)) / (2 * h) == pytest.approx(k_s, rel=1e-8)
     assert (law(lead_speed=h) - law(lead_speed=-h)) / (2 * h) == pytest.approx(k_v, rel=1e-8)
     assert (law(accel=h) - law(accel=-h)) / (2 * h) == pytest.approx(k_a, rel=1e-8)
@@ -96,7 +96,7 @@ def test_inside_the_box_the_mpc_drives_like_its_linear_law():
     mpc = MPC()
     run, linear = (
         simulate(leader, mpc, **settings),
-        simulate(leader, LinearController(mpc.equivalent_gains()), **settings),
+        simulate(leader, LinearController(mpc.gains), **settings),
     )
     assert run.accel_cmd.abs().max() < 4
     torch.testing.assert_close(run.accel, linear.accel, rtol=0, atol=1e-10)

@@ -26,8 +26,8 @@ def test_probabilities_are_shares_of_the_draws(draws, dead_time):
     T, K = draws
     gaps = torch.tensor([1.0, 1.6, 2.5], dtype=torch.float64)
     gains = torch.tensor([NOMINAL, [3.0, 3.0, -1.8], [1.0, 2.0, -0.2]], dtype=torch.float64)
-    local = stability.p_locally_stable(T, K, gaps[:, None], gains, dead_time=dead_time)
-    string = stability.p_string_stable(T, K, gaps[:, None], gains, dead_time=dead_time)
+    local, string = stability.p_locally_and_string_stable(T, K, gaps[:, None], gains, dead_time=dead_time)
+    assert torch.equal(string, stability.p_string_stable(T, K, gaps[:, None], gains, dead_time=dead_time))
     assert local.shape == string.shape == (3, 3)
     for i in range(3):
         for j in range(3):
@@ -90,7 +90,8 @@ def test_margins_carry_order_statistics(draws):
 def test_known_numbers_are_draws_that_never_vary():
     gaps = torch.tensor([1.0, 2.5], dtype=torch.float64)
     assert stability.p_string_stable(1.5, 0.5, gaps, NOMINAL).tolist() == [0.0, 1.0]
-    assert stability.p_locally_stable(0.3, 1.0, 1.0, NOMINAL, dead_time=torch.tensor([0.4, 0.6])).item() == 0.5
+    late = torch.tensor([0.4, 0.6])
+    assert stability.p_locally_and_string_stable(0.3, 1.0, 1.0, NOMINAL, dead_time=late)[0].item() == 0.5
     with pytest.raises(InputError, match="draw"):
         stability.p_string_stable(torch.zeros(0), torch.zeros(0), 1.0, NOMINAL)
     with pytest.raises(InputError, match="gains"):
@@ -124,12 +125,12 @@ def test_paper_regions_shrink_with_lag_and_grow_with_the_gap(form):
     plane = (("k_s", torch.linspace(0.05, 3, 40)), ("k_v", torch.linspace(0, 3, 40)))
     short, long = (stability.region(*plane, T_L=(0.0, T), form=form) for T in (0.1, 1.0))
     assert long.string_share < short.string_share
-    assert long.local_share <= short.local_share
+    assert long.local.sum() <= short.local.sum()
     assert not (long.string & ~short.string).any()
     # The first line of Eq. 3 tightens with the gap and the last one relaxes, so the lag is kept small here.
     near, far = (stability.region(*plane, T_L=(0.0, 0.1), time_gap=tau, form=form) for tau in (0.5, 2.0))
     assert near.string_share < far.string_share
-    assert near.local_share <= far.local_share
+    assert near.local.sum() <= far.local.sum()
 
 
 def test_exact_region_grows_with_the_gap():

@@ -13,18 +13,17 @@ from avtorch.vehicle.stability.belief import (
     Interval,
     StabilityBelief,
     p_locally_and_string_stable,
-    p_locally_stable,
     p_string_stable,
     stability_belief,
 )
-from avtorch.vehicle.stability.chain import Chain, ChainVerdict, actuator, chain_gain, chain_verdict, frequencies
+from avtorch.vehicle.stability.chain import Chain, ChainVerdict, actuator, chain_verdict, frequencies
 from avtorch.vehicle.stability.conditions import (
     Conditions,
     local_conditions,
     string_conditions,
     string_sufficient,
 )
-from avtorch.vehicle.stability.exact import string_margin, string_margins
+from avtorch.vehicle.stability.exact import string_margins
 from avtorch.vehicle.stability.local_and_string import (
     dead_time_margin,
     local_stable,
@@ -33,7 +32,7 @@ from avtorch.vehicle.stability.local_and_string import (
     string_stable,
 )
 from avtorch.vehicle.stability.region import Region, region
-from avtorch.vehicle.stability.transfer import gain, transfer_function
+from avtorch.vehicle.stability.transfer import gain
 
 __all__ = [
     "Chain",
@@ -43,7 +42,6 @@ __all__ = [
     "Region",
     "StabilityBelief",
     "actuator",
-    "chain_gain",
     "chain_verdict",
     "dead_time_margin",
     "frequencies",
@@ -51,16 +49,13 @@ __all__ = [
     "local_conditions",
     "local_stable",
     "p_locally_and_string_stable",
-    "p_locally_stable",
     "p_string_stable",
     "peak_frequency",
     "peak_gain",
     "region",
     "stability_belief",
     "string_conditions",
-    "string_margin",
     "string_margins",
     "string_stable",
     "string_sufficient",
-    "transfer_function",
 ]

@@ -48,20 +48,6 @@ class StabilityBelief:
     margins: dict[str, Interval]
 
 
-def p_locally_stable(
-    T_L: Drawn, K_L: Drawn, time_gap: Value, gains: Gains, *, dead_time: Drawn = 0.0
-) -> Float[Tensor, "*setting"]:
-    """P(locally stable) of every setting under draws of the actuation, shape (setting,) or that of the settings.
-
-    The vehicle, T_L [s], K_L [-] and dead_time [s], has its draws on the last dimension: (draw,) for all settings
-    alike, or (setting, draw) where a setting changes it (a lower level: effective T_L and K_L). Numbers are known
-    values. The settings, time_gap (setting,) and gains (setting, 3), broadcast with each other. Draws that leave the
-    loop without a stable actuator (T_L < 0 or infinite, K_L <= 0) count as unstable. Raises InputError as
-    `local_stable`, and where there is no draw.
-    """
-    return _share(locally_stable, _Blocks(T_L, K_L, time_gap, gains, dead_time, 0.0, 0.0))
-
-
 def p_string_stable(
     T_L: Drawn,
     K_L: Drawn,
@@ -72,7 +58,13 @@ def p_string_stable(
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
 ) -> Float[Tensor, "*setting"]:
-    """P(string stable), arguments as in `p_locally_stable`; feedforward [-] and its delay [s] belong to the setting.
+    """P(string stable) of every setting under draws of the actuation, shape (setting,) or that of the settings.
+
+    The vehicle, T_L [s], K_L [-] and dead_time [s], has its draws on the last dimension: (draw,) for all settings
+    alike, or (setting, draw) where a setting changes it (a lower level: effective T_L and K_L). Numbers are known
+    values. The settings, time_gap (setting,), gains (setting, 3), feedforward [-] and its delay [s], broadcast with
+    each other. Draws that leave the loop without a stable actuator (T_L < 0 or infinite, K_L <= 0) count as unstable.
+    Raises InputError as `string_stable`, and where there is no draw.
 
     Example:
         >>> import torch
@@ -82,7 +74,8 @@ def p_string_stable(
         >>> p_string_stable(T_L, 0.6, time_gap=1.0, gains=gains).round(decimals=2).tolist()
         [0.0, 0.52]
     """
-    return _share(string_stable_of, _Blocks(T_L, K_L, time_gap, gains, dead_time, feedforward, feedforward_delay))
+    blocks = _Blocks(T_L, K_L, time_gap, gains, dead_time, feedforward, feedforward_delay)
+    return blocks.share(string_stable_of)
 
 
 def p_locally_and_string_stable(
@@ -95,10 +88,9 @@ def p_locally_and_string_stable(
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
 ) -> tuple[Float[Tensor, "*setting"], Float[Tensor, "*setting"]]:
-    """P(locally stable) and P(string stable), arguments as in `p_string_stable`, in little more time than one."""
+    """P(locally stable) and P(string stable), arguments as in `p_string_stable`."""
     blocks = _Blocks(T_L, K_L, time_gap, gains, dead_time, feedforward, feedforward_delay)
-    shares = [[s.full(verdict(s)).double().mean(-1) for verdict in (locally_stable, string_stable_of)] for s in blocks]
-    return blocks.join([local for local, _ in shares]), blocks.join([string for _, string in shares])
+    return blocks.share(locally_stable), blocks.share(string_stable_of)
 
 
 def stability_belief(
@@ -113,19 +105,14 @@ def stability_belief(
 ) -> StabilityBelief:
     """Probabilities and margins with intervals, arguments as in `p_string_stable`."""
     blocks = _Blocks(T_L, K_L, time_gap, gains, dead_time, feedforward, feedforward_delay)
-    local: list[Tensor] = []
-    string: list[Tensor] = []
-    n = blocks.draws
     margins: dict[str, list[Interval]] = {}
     for s in blocks:
-        local.append(s.full(locally_stable(s)).double().mean(-1))
-        string.append(s.full(string_stable_of(s)).double().mean(-1))
         for name, draws in _margins(s).items():
             margins.setdefault(name, []).append(_interval(s.full(draws)))
-    p_local, p_string = blocks.join(local), blocks.join(string)
+    p_string, n = blocks.share(string_stable_of), blocks.draws
     shrunk = (p_string * n + 2) / (n + 4)
     return StabilityBelief(
-        p_locally_stable=p_local,
+        p_locally_stable=blocks.share(locally_stable),
         p_string_stable=p_string,
         error=(shrunk * (1 - shrunk) / (n + 4)).sqrt(),
         margins={k: Interval(*(blocks.join(list(q)) for q in zip(*v, strict=True))) for k, v in margins.items()},
@@ -148,10 +135,6 @@ def _interval(draws: Float[Tensor, "setting draw"]) -> Interval:
     ordered = draws.sort(-1).values
     n = ordered.shape[-1]
     return Interval(*(ordered[..., min(n - 1, int(q * n))] for q in (0.05, 0.5, 0.95)))
-
-
-def _share(verdict: Callable[[LinearLoop], Tensor], blocks: _Blocks) -> Float[Tensor, "*setting"]:
-    return blocks.join([s.full(verdict(s)).double().mean(-1) for s in blocks])
 
 
 class _Blocks:
@@ -199,6 +182,10 @@ class _Blocks:
         rows = max(1, BLOCK // self.draws)
         for start in range(0, count, rows):
             yield s.map(lambda x, start=start: x[start : start + rows])
+
+    def share(self, verdict: Callable[[LinearLoop], Tensor]) -> Float[Tensor, "*setting"]:
+        """The share of the draws for which `verdict` holds."""
+        return self.join([s.full(verdict(s)).double().mean(-1) for s in self])
 
     def join(self, parts: list[Tensor]) -> Tensor:
         if not parts:

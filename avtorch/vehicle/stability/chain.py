@@ -116,21 +116,6 @@ def chain_verdict(
     return ChainVerdict(local, local & (peak <= 1 + SLACK), peak)
 
 
-def chain_gain(
-    chain: Chain,
-    time_gap: Float[Tensor, "*#batch"],
-    gains: Float[Tensor, "*#batch 3"],
-    *,
-    inner: float | Float[Tensor, "*#batch"] = 0.0,
-    forward: float | Float[Tensor, "*#batch"] = 1.0,
-    feedforward: float | Float[Tensor, "*#batch"] = 0.0,
-    feedforward_delay: float = 0.0,
-) -> Float[Tensor, "*all frequency"]:
-    """`|V / V_lead|` (..., frequency), arguments as in `chain_verdict`; formal where the loop is locally unstable."""
-    loop, asked = _loop(chain, time_gap, gains, inner, forward, feedforward, feedforward_delay)
-    return asked.abs() / loop.abs().clamp_min(1e-300)
-
-
 def _loop(
     chain: Chain,
     time_gap: Tensor,

@@ -27,23 +27,6 @@ def string_margins(
     return s.full(torch.where(s.valid, B, low)), s.full(torch.where(s.valid, C, low))
 
 
-def string_margin(
-    T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, feedforward: Value = 0.0
-) -> Float[Tensor, "*setting"]:
-    """The least of T^2 x^2 + B x + C over x = omega^2 >= 0: the gain condition holds iff it is >= 0.
-
-    T_L [s], K_L [-], time_gap [s] and feedforward [-] broadcast with the leading dimensions of gains (..., 3); returns
-    that shape, in 1/s^2. One number for both cases of the exact condition: C where B >= 0, else C - B^2 / (4 T^2). It
-    does not imply local stability.
-    """
-    s = linear_loop(T_L, K_L, time_gap, gains, feedforward=feedforward)
-    B, C = coefficients(s)
-    dip = torch.where(B < 0, B, torch.zeros_like(B)) ** 2 / (4 * torch.where(s.T > 0, s.T, torch.ones_like(s.T)) ** 2)
-    endless = (B < 0) & (s.T == 0)
-    least = torch.where(endless, torch.full_like(dip, -torch.inf), C - dip)
-    return s.full(torch.where(s.valid, least, torch.full_like(least, -torch.inf)))
-
-
 def coefficients(s: LinearLoop) -> tuple[Float[Tensor, "*setting"], Float[Tensor, "*setting"]]:
     """(B, C), the dead time and the feed-forward's delay ignored."""
     B = s.b**2 - 2 * s.T * s.K * s.g - (s.K * s.kf) ** 2

@@ -37,11 +37,6 @@ class Region:
     peak_gain: Float[Tensor, "y x"] | None
 
     @property
-    def local_share(self) -> float:
-        """Share of the plane's points that is locally stable."""
-        return float(self.local.double().mean())
-
-    @property
     def string_share(self) -> float:
         """Share of the plane's points that is string stable."""
         return float(self.string.double().mean())

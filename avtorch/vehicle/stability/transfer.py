@@ -5,36 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Complex, Float
-from avtorch.vehicle.arguments import broadcast
+from avtorch.arrays import Float
 from avtorch.vehicle.stability.linear_loop import Gains, LinearLoop, Value, as_tensor, linear_loop
-
-
-def transfer_function(
-    omega: Value,
-    T_L: Value,
-    K_L: Value,
-    time_gap: Value,
-    gains: Gains,
-    *,
-    dead_time: Value = 0.0,
-    feedforward: Value = 0.0,
-    feedforward_delay: Value = 0.0,
-) -> Complex[Tensor, "*setting"]:
-    """G(j omega) = V / V_lead, complex, of the shape that omega [rad/s] and the setting broadcast to.
-
-    With E = exp(-j omega theta): G = K E (k_f s^2 E_f + k_v s + k_s) / (T s^3 + s^2 + K E (-k_a s^2 + g s + k_s)).
-    Formal where the loop is locally unstable; 0 where the actuation is no vehicle (T_L < 0, K_L <= 0, not finite).
-    """
-    w = as_tensor(omega, [omega, T_L, K_L, time_gap, gains], "omega")
-    s = linear_loop(
-        T_L, K_L, time_gap, gains, dead_time=dead_time, feedforward=feedforward, feedforward_delay=feedforward_delay
-    )
-    (nr, ni), (fr, fi) = _numerator(s, w), _denominator(s, w)
-    # The common factor exp(-j omega theta) of the numerator is left out of |G| but belongs to G.
-    turn = torch.exp(torch.complex(torch.zeros_like(w * s.theta), -w * s.theta))
-    response = turn * torch.complex(*broadcast(nr, ni)) / torch.complex(*broadcast(fr, fi))
-    return torch.where(s.valid, response, torch.zeros_like(response))
 
 
 def gain(
@@ -48,7 +20,10 @@ def gain(
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
 ) -> Float[Tensor, "*setting"]:
-    """`|G(j omega)|` [-], as `transfer_function`.
+    """`|G(j omega)|` [-] of V / V_lead, of the shape that omega [rad/s] and the setting broadcast to.
+
+    With E = exp(-j omega theta): G = K E (k_f s^2 E_f + k_v s + k_s) / (T s^3 + s^2 + K E (-k_a s^2 + g s + k_s)).
+    Formal where the loop is locally unstable; 0 where the actuation is no vehicle (T_L < 0, K_L <= 0, not finite).
 
     Example:
         >>> from avtorch.vehicle.stability import gain

@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from avtorch.errors import InputError
@@ -52,55 +51,16 @@ def test_writes_answer_and_picture_and_goes_on(
         command.main(["--n", "3", *line[:-2]])
 
 
-@pytest.fixture
-def laps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    monkeypatch.chdir(tmp_path)
-    names = ["lap1.csv", "lap2.csv"]
-    for lap, name in enumerate(names, 1):
-        time = np.arange(400) / 20
-        command = np.sin(0.5 * lap * time)
-        log = Log.from_arrays(time=time, accel_cmd=command, accel=0.9 * command, speed=15 + np.cumsum(command) / 20)
-        log.write(name)
-    return names
-
-
-def test_effects_in_front_of_recordings(
-    quick: list[str], laps: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "x"
-    line = ["--background", *laps, "--seed", "4", "--effects", "dead_time,gust", "--out", str(out)]
-    command.main(line)
-    told = " ".join(capsys.readouterr().out.split())
-    assert "nothing: unknown or none." in told
-    assert "0/12" in told
-    assert "lap1.csv, untouched: none." in told
-    assert {"background.json", "trial.json", "truth", "answers"} == {p.name for p in out.iterdir()}
-    answer = json.loads((out / "background.json").read_text(encoding="utf-8"))
-    assert [(one["size"], one["trials"]) for one in answer["by_size"]] == [(0.5, 4), (0.8, 4), (1.25, 4)]
-    assert answer["totals"]["nothing_named"] == answer["totals"]["trials"] == len(quick) - 2 == 12
-    command.main(line)
-    assert len(quick) == 14
-    one = ["--signals", "speed", "--sizes", "1", "--effects", "dead_time,sensor_bias", "--out", str(tmp_path / "y")]
-    command.main(["--background", laps[0], "--seed", "4", *one])
-    assert "recording: sensor_bias." in " ".join(capsys.readouterr().out.split()).replace(
-        "Not put in front of every log, where they would change nothing", "recording"
-    )
-
-
 @pytest.mark.parametrize(
     ("line", "told"),
     [
-        (["--background", "a.csv", "--n", "3"], "--n does not go with --background"),
-        (["--background", "a.csv", "--recorder", "ordinary"], "--recorder does not go with --background"),
-        (["--background", "a.csv", "--sizes", "big"], "--sizes: found 'big'"),
-        (["--n", "1", "--draws", "2"], "--draws does not go without --background"),
         (["--n", "1", "--mix", "none=0.5,several=0.4"], "--mix: found 'none=0.5,several=0.4'"),
         (["--n", "1", "--mix", "none=0.5,none=0.5"], "--mix: found 'none=0.5,none=0.5'"),
         (["--n", "1", "--mix", "none=x"], "--mix: found 'none=x'"),
-        ([], "needs --n, or --background"),
+        ([], "required: --n"),
     ],
 )
-def test_what_does_not_go_together_is_refused(line: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_wrong_is_refused(line: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
         command.main([*line, "--seed", "1"])
     assert end.value.code == 2

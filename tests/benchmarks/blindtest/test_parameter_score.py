@@ -10,10 +10,10 @@ import torch
 
 from avtorch.gap import SimulatorInput, plant
 from avtorch.gap.simulator.effect import effect_class
-from benchmarks.blindtest import EFFECTS, Car, Recorded, simulate
+from benchmarks.blindtest import EFFECTS, IN_FRONT, Car, Recorded, simulate
 from benchmarks.blindtest.answers import read_answer
 from benchmarks.blindtest.intervals import wilson
-from benchmarks.blindtest.parameter_score import SAME, found_sizes
+from benchmarks.blindtest.parameter_score import SAME, SIZE_OF, found_sizes
 from benchmarks.blindtest.score import score
 from tests.benchmarks.blindtest.test_budget_score import divided
 from tests.benchmarks.blindtest.test_score import answer
@@ -23,6 +23,14 @@ CAUSES: dict[str, dict[str, float]] = {
     "sensor_scale": {"scale": 1.2},
     "road_grade": {"grade_rms": 0.03, "length_m": 100.0},
 }
+
+
+def test_every_effect_in_front_has_a_size_that_both_sides_tell() -> None:
+    assert SIZE_OF.keys() == IN_FRONT.keys()
+    for effect, (parameter, without, _) in SIZE_OF.items():
+        own = {p.name: p for p in effect_class(effect).parameters}
+        assert own[parameter].reported, effect
+        assert without == own[parameter].neutral, effect
 
 
 def case(causes: dict[str, dict[str, float]], kind: str = "several") -> dict[str, Any]:
