@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +13,10 @@ from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.clock import clock_words, gap_limit, median_step, since, since_start
 from avtorch.io.mapping import PEDALS, SIGNALS, SignalMap
 from avtorch.io.merge import Arrivals, held
-from avtorch.io.tables import Table, read_table
+from avtorch.io.tables import Table
 from avtorch.io.units import stated_unit, to_si
-from avtorch.io.validity import MOST_BAD, BadRows, check_range, check_rate, check_time, disordered, off_clock, stray
+from avtorch.io.validity import BadRows, check_range, check_rate, check_time, time_faults
 
-_NAME = 40  # characters of the longest column name that may be a signal's, mistyped
 # change of speed that an accelerometer in order notices: 1 m/s, and a tenth of the speed of what is slower
 _DEAD_MPS, _DEAD_SHARE = 1.0, 0.1
 
@@ -34,15 +31,13 @@ class Assembled:
     remarks: tuple[str, ...]
 
 
-def assemble(
-    table: Table, mapping: SignalMap, *, folder: Path, following: bool, arrived: Arrivals | None = None
-) -> Assembled:
+def assemble(table: Table, mapping: SignalMap, *, following: bool, arrived: Arrivals | None = None) -> Assembled:
     """Find, convert, check and merge the signals of a log.
 
-    ``folder`` is where other files named in the mapping lie; ``arrived`` holds signals that are not in the table. Rows
-    where a signal with its own stamps had not arrived, or is older than three of its own steps (0.1 s at least), are
-    left out, which makes a gap; ``engaged`` and ``segment`` are states whose messages mark changes only, so they are
-    held indefinitely. Raises InputError for everything that is certainly wrong.
+    ``arrived`` holds signals that are not in the table. Rows where a signal with its own stamps had not arrived, or is
+    older than three of its own steps (0.1 s at least), are left out, which makes a gap; ``engaged`` and ``segment`` are
+    states whose messages mark changes only, so they are held indefinitely. Raises InputError for everything that is
+    certainly wrong.
     """
     source = table.source
     arrived = arrived or {}
@@ -57,14 +52,12 @@ def assemble(
     spare = _not_needed(table, mapping, arrived)
     for signal in SIGNALS:
         column = mapping.column.get(signal, signal)
-        if signal in mapping.elsewhere:
-            arrivals[signal] = _from_elsewhere(signal, mapping, folder)
-        elif signal in spare:
+        if signal in spare:
             _spare(table, signal, signals, mapping, remarks)
         elif signal in arrived:
             stamps, values = arrived[signal]
             rows = np.arange(len(stamps))
-            arrivals[signal] = _arrivals(table, signal, column, "its clock", values, stamps, rows, None, mapping)
+            arrivals[signal] = _arrivals(table, signal, column, "its clock", values, stamps, rows, mapping)
         elif column in table.names:
             if signal in mapping.stamp:
                 arrivals[signal] = _stamped(table, signal, column, mapping)
@@ -113,7 +106,7 @@ def assemble(
     if "segment" in signals:
         fresh |= np.diff(signals["segment"]) != 0
     segment = np.concatenate([[0], np.cumsum(fresh)]).astype(np.int64)
-    used = {mapping.column.get(signal, signal) for signal in SIGNALS if signal not in mapping.elsewhere}
+    used = {mapping.column.get(signal, signal) for signal in SIGNALS}
     used |= set(mapping.stamp.values())
     ignored = tuple(printable(name, 200) for name in table.names if name not in used)
     return Assembled(signals, segment, ignored, tuple(remarks))
@@ -155,11 +148,11 @@ def _converted(signal: str, values: FloatArray, mapping: SignalMap) -> FloatArra
 
 def _require(table: Table, mapping: SignalMap, following: bool) -> None:
     def there(signal: str) -> bool:
-        return mapping.column.get(signal, signal) in table.names or signal in mapping.elsewhere
+        return mapping.column.get(signal, signal) in table.names
 
     for option in (mapping.column, mapping.stamp):
         for signal, column in option.items():
-            if column not in table.names and signal not in mapping.elsewhere:
+            if column not in table.names:
                 there_are = listed(table.names)
                 raise InputError(f"{table.source}: column {quoted(column)} ({signal}) is missing; columns: {there_are}")
     commanded = any(there(signal) for signal in ("accel_cmd", *PEDALS, "speed_cmd"))
@@ -169,27 +162,20 @@ def _require(table: Table, mapping: SignalMap, following: bool) -> None:
         needed = ("time",) if commanded else ("time", "accel_cmd")
     for signal in needed:
         if not there(signal):
-            advice = _advice(signal, table.names)
+            advice = _advice(signal, table)
             if signal == "accel_cmd" and there("spacing") and there("lead_speed"):
                 advice += "; `--follower` diagnoses a car-following log without it"
             elif signal == "accel_cmd":
                 advice += f"; {', '.join(PEDALS)} or speed_cmd can stand for it"
             raise InputError(f"{table.source}: column {signal!r} is missing; {advice}")
     if not there("accel") and not there("speed"):
-        advice = _advice("speed", table.names)
+        advice = _advice("speed", table)
         raise InputError(f"{table.source}: columns 'accel' and 'speed' are both missing; one is needed; {advice}")
-    for signal in mapping.stamp:
-        if signal in mapping.elsewhere:
-            raise InputError(f"{table.source}: {signal} has a stamp column and also a file of its own; one is enough")
 
 
-def _advice(signal: str, names: Iterable[str]) -> str:
-    # a column that is a signal already goes by its own name: a measured `accel` is no command
-    plain = {name.strip().lower(): name for name in names if name not in SIGNALS and len(name) <= _NAME}
-    close = difflib.get_close_matches(signal, plain, n=1, cutoff=0.75)
-    name = plain[close[0]] if close else "NAME"
-    shell = f"--map {signal}={quoted(name) if close else name}"
-    return f"columns: {listed(names)}; `{shell}` or `map={ {signal: name} }` if it goes by another name"
+def _advice(signal: str, table: Table) -> str:
+    option = {signal: "NAME"}
+    return f"columns: {listed(table.names)}; `--map {signal}=NAME` or `map={option}` if it goes by another name"
 
 
 def _place(table: Table, signal: str, column: str, rows: NDArray | None = None) -> Callable[[int], str]:
@@ -202,21 +188,17 @@ def _signal(table: Table, signal: str, column: str, mapping: SignalMap, bad: Bad
     read = table.readings(column, as_time=signal == "time", as_state=signal == "engaged")
     bad.leave_out(read.faults)
     remarks += read.remarks
-    values = read.values
-    values = _converted(signal, values, mapping)
-    place = _place(table, signal, column)
-    outside = stray(signal, values, place)
+    values = _converted(signal, read.values, mapping)
+    outside = check_range(signal, values, _place(table, signal, column), spares=True)
     bad.leave_out(outside)
     values[list(outside)] = np.nan
-    known = np.flatnonzero(~np.isnan(values))
-    check_range(signal, values[known], _place(table, signal, column, known))
     return values
 
 
 def _not_needed(table: Table, mapping: SignalMap, arrived: Arrivals) -> set[str]:
     """Commands that are no accelerations, in a log that has one and does not ask for them by its mapping."""
     command = "accel_cmd" in arrived or mapping.column.get("accel_cmd", "accel_cmd") in table.names
-    others = {*PEDALS, "speed_cmd"} - set(mapping.column) - set(mapping.unit) - set(mapping.elsewhere)
+    others = {*PEDALS, "speed_cmd"} - set(mapping.column) - set(mapping.unit)
     return others if command else set()
 
 
@@ -241,12 +223,8 @@ def _leave_out_disordered(table: Table, signals: dict[str, FloatArray], clock: s
     rows = np.flatnonzero(bad.kept)
     time = signals["time"]
     drive = signals.get("segment", np.zeros(len(time)))
-    for faults_of in (off_clock, disordered):
-        rows = rows[bad.kept[rows]]
-        faults = faults_of(time[rows], drive[rows], _place(table, "time", clock, rows))
-        if len(faults) > MOST_BAD * len(time):
-            check_time(time[rows], np.diff(drive[rows]) == 0, _place(table, "time", clock, rows))
-        bad.leave_out({int(rows[row]): words for row, words in faults.items()})
+    faults = time_faults(time[rows], drive[rows], _place(table, "time", clock, rows))
+    bad.leave_out({int(rows[row]): words for row, words in faults.items()})
 
 
 def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tuple[FloatArray, FloatArray]:
@@ -254,7 +232,6 @@ def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tupl
     clock = mapping.stamp[signal]
     values = table.numbers(column, empty_is_nan=True)
     stamps = table.numbers(clock, empty_is_nan=True)
-    unit = mapping.unit.get("time")
     own_clock = clock != mapping.column.get("time", "time")
     half = np.isnan(values) != np.isnan(stamps) if own_clock else np.zeros(len(values), bool)
     if half.any():
@@ -262,38 +239,12 @@ def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tupl
         empty, full = (column, clock) if np.isnan(values[row]) else (clock, column)
         raise InputError(f"{table.where(row, empty)}: is empty where {full!r} is not; both or neither are needed")
     rows = np.flatnonzero(~np.isnan(values))
-    return _arrivals(table, signal, column, clock, values, stamps, rows, unit, mapping)
-
-
-def _from_elsewhere(signal: str, mapping: SignalMap, folder: Path) -> tuple[FloatArray, FloatArray]:
-    """Arrivals of a signal that lies in a file of its own, beside the log."""
-    there = mapping.elsewhere[signal]
-    column = there.column or mapping.column.get(signal, signal)
-    table = read_table(_within(folder, there.file, signal), wanted=lambda names: {column, there.time})
-    for name in (column, there.time):  # messages must not quote other content of a file that only the mapping names
-        if name not in table.names:
-            raise InputError(f"{table.source}: column {quoted(name)} ({signal}) is missing")
-    values, stamps = table.numbers(column), table.numbers(there.time)
-    unit = there.time_unit or mapping.unit.get("time")
-    rows = np.arange(len(values))
-    return _arrivals(table, signal, column, there.time, values, stamps, rows, unit, mapping)
-
-
-def _within(folder: Path, file: str, signal: str) -> Path:
-    """The place of a file that a mapping names. A mapping is not trusted: it may not point outside the log's folder."""
-    try:
-        there = (folder / file).resolve()
-        inside = there.is_relative_to(folder.resolve()) and not Path(file).is_absolute()
-    except (OSError, ValueError, RuntimeError):  # too long, with a zero byte in it, or links in a circle
-        inside, there = False, folder
-    if not inside:
-        raise InputError(f"[signals.{signal}] file: found {quoted(file)}, needs a file in the log's folder or below")
-    return folder / file
+    return _arrivals(table, signal, column, clock, values, stamps, rows, mapping, mapping.unit.get("time"))
 
 
 def _arrivals(
     table: Table, signal: str, column: str, clock: str, values: FloatArray, stamps: FloatArray, rows: NDArray,
-    time_unit: str | None, mapping: SignalMap,
+    mapping: SignalMap, time_unit: str | None = None,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     if len(rows) == 0:
         raise InputError(f"{table.source}: column {column!r} ({signal}): holds no value at all")
@@ -304,5 +255,5 @@ def _arrivals(
     # a recorder that writes the last arrival into every row repeats stamp and value together; that is one arrival
     again = np.concatenate([[False], (np.diff(stamps) == 0) & (np.diff(values) == 0)])
     rows, values, stamps = rows[~again], values[~again], stamps[~again]
-    check_time(stamps, np.ones(len(stamps) - 1, bool), _place(table, f"stamp of {signal}", clock, rows))
+    check_time(stamps, _place(table, f"stamp of {signal}", clock, rows))
     return stamps, values

@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -179,7 +180,9 @@ def _follower(table: Table, platoon: str, vehicle: int | None) -> int:
     return own
 
 
-def _leader(table: Table, clock: str, column: str, *, name: str, rows: slice = slice(None), note: str = "") -> RawLeader:
+def _leader(
+    table: Table, clock: str, column: str, *, name: str, rows: slice = slice(None), note: str = ""
+) -> RawLeader:
     """The leader of some rows of two columns, checked, cut to the longest stretch that is whole.
 
     Empty cells of a recording and long steps end a stretch.
@@ -190,7 +193,7 @@ def _leader(table: Table, clock: str, column: str, *, name: str, rows: slice = s
     if len(time) < 2:
         raise InputError(f"{table.source}: {name} has {len(time)} rows of data; a leader needs at least two")
     first = rows.start or 0
-    check_time(time, np.ones(len(time) - 1, bool), lambda row: table.where(first + row, clock))
+    check_time(time, lambda row: table.where(first + row, clock))
     known = ~np.isnan(speed)
     check_range("speed", np.where(known, speed, 0.0), lambda row: table.where(first + row, column))
     whole = _longest(known[1:] & known[:-1] & (np.diff(time) <= LONG_STEP_S))
@@ -226,7 +229,7 @@ def _events(table: Table) -> dict[int, slice]:
         raise InputError(f"{where}: is {numbers[bad[0]]:g}; a whole number is needed")
     found: dict[int, slice] = {}
     edges = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in pairwise(edges):
         event = int(numbers[first])
         if event in found:
             where = table.where(first, "event")

@@ -122,10 +122,10 @@ class Log(Displayed):
                 )
             columns = {signal: mapping.column.get(signal, signal) for signal in SIGNALS if signal != "time"}
             recorded, arrived = merged(open_recording(path), columns)
-            return cls._of(recorded, mapping, folder=Path(path).parent, following=following, arrived=arrived)
+            return cls._of(recorded, mapping, following=following, arrived=arrived)
         wanted = {mapping.column.get(signal, signal) for signal in SIGNALS} | set(mapping.stamp.values())
         table = read_table(path, wanted=lambda names: wanted)
-        return cls._of(table, mapping, folder=Path(path).parent, following=following)
+        return cls._of(table, mapping, following=following)
 
     @classmethod
     def from_arrays(cls, *, name: str = "arrays", unit: Pairs = None, following: bool = False, **columns: Any) -> Log:
@@ -149,7 +149,7 @@ class Log(Displayed):
         if len(set(lengths.values())) > 1:
             raise InputError(f"{name}: signals differ in length: {', '.join(f'{k} {n}' for k, n in lengths.items())}")
         table = Table(name, tuple(given), tuple(given.values()))
-        return cls._of(table, SignalMap(unit=pairs("unit", unit)), folder=Path(), following=following)
+        return cls._of(table, SignalMap(unit=pairs("unit", unit)), following=following)
 
     @classmethod
     def from_dataframe(
@@ -168,13 +168,11 @@ class Log(Displayed):
         A named index is a column; an index of times without a name is ``time`` (`avtorch.io.dataframe`).
         """
         mapping = given_mapping(SignalMap(), map=map, unit=unit, stamp=stamp, state=state)
-        return cls._of(frame_table(frame, name), mapping, folder=Path(), following=following)
+        return cls._of(frame_table(frame, name), mapping, following=following)
 
     @classmethod
-    def _of(
-        cls, table: Table, mapping: SignalMap, *, folder: Path, following: bool, arrived: Arrivals | None = None
-    ) -> Log:
-        made = assemble(table, mapping, folder=folder, following=following, arrived=arrived)
+    def _of(cls, table: Table, mapping: SignalMap, *, following: bool, arrived: Arrivals | None = None) -> Log:
+        made = assemble(table, mapping, following=following, arrived=arrived)
         signals = made.signals
         time = signals["time"]
         log = cls(

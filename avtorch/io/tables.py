@@ -9,7 +9,6 @@ import re
 from array import array
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,10 @@ from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats.apart import parquet_apart
 from avtorch.io.formats.parquet import cells_of as arrow_cells
 from avtorch.io.opening import MOST_BYTES, MOST_CELLS, MOST_COLUMNS, beginning, place, read_regular
-from avtorch.io.text import Layout, cells_of, decoded, is_time, layout_of, rows_of, seconds_of, unzipped
+from avtorch.io.text import decoded, is_time, layout_of, rows_of, seconds_of, unzipped
 from avtorch.numeral import numeral
 
 _NEED = "a CSV or Parquet file"
-_LINES_AHEAD = 100  # lines searched for a header that other lines precede
 
 Wanted = Callable[[tuple[str, ...]], Collection[str]]
 """Selects the columns to read from the names of a file's columns."""
@@ -45,7 +43,6 @@ class Table:
     names: tuple[str, ...]
     cells: tuple[Sequence[Any] | NDArray | None, ...]
     lines: Sequence[int] | None = None
-    first: int = 0  # rows of the file before this part of it
     decimal: str = "."
     units: Mapping[str, str] = field(default_factory=dict)
     faults: Mapping[int, str] = field(default_factory=dict)
@@ -63,7 +60,7 @@ class Table:
         """The place of a row, or of its cell, in words; ``row`` counts from 0."""
         line = f" (line {self.lines[row]})" if self.lines is not None else ""
         cell = "" if column is None else f", column {quoted(column)}"
-        return f"{self.source}: row {self.first + row + 1}{line}{cell}"
+        return f"{self.source}: row {row + 1}{line}{cell}"
 
     def numbers(self, column: str, *, empty_is_nan: bool = False) -> FloatArray:
         """A column as float64, ``(row,)``.
@@ -181,12 +178,11 @@ def _no_number(cell: Any, need: str) -> str:
     return f"{quoted(cell, 30)} is no number; a number is needed"
 
 
-def read_table(path: str | os.PathLike[str], *, header: str | None = None, wanted: Wanted | None = None) -> Table:
+def read_table(path: str | os.PathLike[str], *, wanted: Wanted | None = None) -> Table:
     """Read a table of text or a Parquet file, of the columns only those that are `wanted` (default: all).
 
     Text is UTF-8, UTF-16 or Windows-1252, may be gzipped, and has its separator, decimal mark, comments and row of
-    units found (`avtorch.io.text`). ``header`` names the first cell of the header line where other lines come
-    before it that look like one. Unnamed columns get the name ``(unnamed 1)`` by position. Lines end at ``\\n``,
+    units found (`avtorch.io.text`). Unnamed columns get the name ``(unnamed 1)`` by position. Lines end at ``\\n``,
     ``\\r\\n`` or ``\\r`` and nowhere else; empty ones are skipped. A row with too few or too many cells is a fault of
     the table. Raises InputError for any other file: missing, not a regular file, empty, binary, no header, and beyond
     512 MiB, 10,000 columns, 1,000,000 characters in a row, or 20 million cells in the wanted columns.
@@ -199,7 +195,7 @@ def read_table(path: str | os.PathLike[str], *, header: str | None = None, wante
     if file.suffix.lower() in (".parquet", ".pq"):
         raise InputError(f"{place(file)}: named as Parquet but its content is not; write it anew, or name it .csv")
     text, remarks = decoded(place(file), raw)
-    return replace(text_table(place(file), text, header, wanted), remarks=remarks)
+    return replace(text_table(place(file), text, wanted), remarks=remarks)
 
 
 def _parquet(file: Path, wanted: Wanted | None) -> Table:
@@ -219,11 +215,9 @@ def read_bytes(file: Path) -> bytes:
     return raw
 
 
-def text_table(source: str, text: str, header: str | None, wanted: Wanted | None) -> Table:
+def text_table(source: str, text: str, wanted: Wanted | None) -> Table:
     """A table of text, by its own layout."""
     layout = layout_of(io.StringIO(text, newline=""))
-    if header is not None:
-        layout = replace(layout, header=_line_of(text, layout, header), marked="", units=False)
     rows = rows_of(source, text, layout)
     names = _names(source, next(rows, None))
     chosen = set(names if wanted is None else wanted(names))
@@ -247,14 +241,6 @@ def text_table(source: str, text: str, header: str | None, wanted: Wanted | None
     form = f"text, {layout.words}"
     both = with_whole_stamps(names, cells)
     return Table(source, *both, lines, decimal=layout.decimal, units=units, faults=faults, form=form)
-
-
-def _line_of(text: str, layout: Layout, first_cell: str) -> int:
-    for number, line in enumerate(islice(io.StringIO(text, newline=""), _LINES_AHEAD), 1):
-        cells = cells_of(line, layout.separator)
-        if cells and cells[0].strip() == first_cell:
-            return number
-    return layout.header
 
 
 def _names(source: str, found: tuple[list[str], int] | None) -> tuple[str, ...]:

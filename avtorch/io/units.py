@@ -75,23 +75,28 @@ def to_si(signal: str, unit: str) -> Callable[[NDArray], NDArray]:
     if signal == "grade" and name in _ANGLE:
         return _ANGLE[name]
     try:
-        factor = numeral(name)
+        size = numeral(name)
     except ValueError:
-        factor = math.nan
-    if not 1e-12 <= abs(factor) <= 1e12:  # NaN, too
+        size = math.nan
+    if not 1e-12 <= abs(size) <= 1e12:  # NaN, too
         also = (*known, *(_ANGLE if signal == "grade" else ()))
         raise InputError(f"unit {shown}: not known for {signal}; known: {', '.join(also)}, or a factor to SI")
-    return _scaled(factor)
+    return _scaled(size)
 
 
-def _scaled(factor: float) -> Callable[[NDArray], NDArray]:
+def factor(signal: str, unit: str) -> float:
+    """Size of a unit in SI."""
+    return float(to_si(signal, unit)(np.ones(1))[0])
+
+
+def _scaled(size: float) -> Callable[[NDArray], NDArray]:
     # dividing keeps 50.4 km/h = 14 m/s exact where multiplying by the rounded 1/3.6 would not
-    if factor == 1.0:
+    if size == 1.0:
         return lambda x: x
-    inverse = round(1 / factor, 9)
-    if abs(inverse * factor - 1) < 1e-15:
+    inverse = round(1 / size, 9)
+    if abs(inverse * size - 1) < 1e-15:
         return lambda x: x / inverse
-    return lambda x: x * factor
+    return lambda x: x * size
 
 
 UNITS: dict[str, tuple[str, ...]] = {

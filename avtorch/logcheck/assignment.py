@@ -21,7 +21,7 @@ from avtorch.io.formats.listed import Recording
 from avtorch.io.formats.presets import PRESETS, Preset, Source
 from avtorch.io.merge import held, merged
 from avtorch.io.tables import Table, whole_stamps
-from avtorch.io.validity import MIN_SPANS, MOST_BAD, SPANS_S, codes
+from avtorch.io.validity import DELAYS_S, MIN_SPANS, MOST_BAD, SPANS_S, codes, integral
 from avtorch.logcheck.recorder import lateness
 from avtorch.logcheck.vocabulary import Header, bare_unit, header_of, likeness, means_otherwise, signals_named
 
@@ -138,7 +138,6 @@ _CHANCE = 3.1
 channels, spans and delays."""
 _ALIKE = 0.98  # correlation from which two columns measure one thing
 _TRIED, _KEPT = 60, 3  # columns without a telling name that are compared with the others, and kept of them
-_DELAYS_S = tuple(np.arange(0, 1.01, 0.1).tolist())
 _MOST_STATES = 8  # numbers of a column that is a flag or a state
 _LARGEST = 1e9  # of a speed or an acceleration, in any unit
 _ACCELS = ("m/s2", "g", "mg", "cm/s2", "ft/s2")
@@ -230,7 +229,7 @@ class _Motion:
         pick = 0 if signal == "speed" else 1
         i, j = self.number[a.name], self.number[b.name]
         found = [abs(float(table[pick][..., i, :].ravel() @ table[pick][..., j, :].ravel())) for table in self.tables]
-        size = len(_DELAYS_S) if pick else 1
+        size = len(DELAYS_S) if pick else 1
         return max(found, default=0.0) / size > _ALIKE
 
     def correlation(self, level: Column, rate: Column) -> float | None:
@@ -239,7 +238,7 @@ class _Motion:
 
     def response(self, channel: str, answer: Column, command: Column) -> float | None:
         """Of the motion that `channel` measures and the integral of `command`, up to 1 s later."""
-        return self._best(0 if channel == "speed" else 1, answer, command, len(_DELAYS_S))
+        return self._best(0 if channel == "speed" else 1, answer, command, len(DELAYS_S))
 
     def _best(self, pick: int, answer: Column, rate: Column, delays: int) -> float | None:
         i, j = self.number[answer.name], self.number[rate.name]
@@ -277,7 +276,7 @@ def _table(
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Changes (column, start), integrals (delay, column, start), each of mean 0 and length 1, and the size of the
     changes as a share of the column's largest value (column,); None where the spans are too few."""
-    last = _DELAYS_S[-1]
+    last = DELAYS_S[-1]
     starts = [np.arange(clock[p][0] + last, clock[p][-1] - span, span / 4) for p in parts if p.stop - p.start > 2]
     if not values or sum(map(len, starts)) < 4 * MIN_SPANS:
         return None
@@ -287,9 +286,9 @@ def _table(
         change, by_delay = [], []
         for part, at in zip(used, starts, strict=True):
             t, y = clock[part], x[part]
-            total = np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(t))])
+            total = integral(t, y)
             change.append(np.interp(at + span, t, y) - np.interp(at, t, y))
-            before = at - np.array(_DELAYS_S)[:, None]
+            before = at - np.array(DELAYS_S)[:, None]
             by_delay.append(np.interp(before + span, t, total) - np.interp(before, t, total))
         both = np.concatenate(change)
         sizes.append(float(both.std()) / max(float(np.abs(x).max()), 1e-300))

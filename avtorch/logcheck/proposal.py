@@ -13,10 +13,10 @@ from avtorch.errors import printable
 from avtorch.io.clock import gap_limit, stretches
 from avtorch.io.mapping import PEDALS, Pairs, SignalMap, given_mapping
 from avtorch.io.tables import Table
-from avtorch.io.units import stated_unit, to_si
+from avtorch.io.units import factor, stated_unit
 from avtorch.io.validity import MOST_BAD
 from avtorch.logcheck.assignment import MOTION, Column, assign, columns_of, filled, is_state, moves, ranked
-from avtorch.logcheck.joint_units import UnitTest, factor, units_together
+from avtorch.logcheck.joint_units import UnitTest, units_together
 from avtorch.logcheck.recorder import lateness
 from avtorch.logcheck.vocabulary import bare_unit, header_of, is_answer, is_asked, likeness, signals_named
 
@@ -77,7 +77,7 @@ def unit_of_command(signal: str, column: Column) -> tuple[str | None, str | None
                 "it is a pressure or a torque"
             )
     if signal == "brake" and float(np.quantile(values, 0.99)) <= 0 > float(values.min()):
-        return f"{-float(to_si(signal, unit or '1')(np.ones(1))[0]):.10g}", doubt
+        return f"{-factor(signal, unit or '1'):.10g}", doubt
     return (None if unit in (None, "m/s", "A", "Pa") or (unit == "Nm" and signal == "torque") else unit), doubt
 
 
