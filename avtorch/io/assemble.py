@@ -62,7 +62,7 @@ def assemble(table: Table, mapping: SignalMap, *, following: bool, arrived: Arri
             if signal in mapping.stamp:
                 arrivals[signal] = _stamped(table, signal, column, mapping)
             else:
-                signals[signal] = _signal(table, signal, column, mapping, bad, remarks)
+                signals[signal] = _signal(table, signal, column, mapping, bad)
     for signal in mapping.unit:
         if signal not in signals and signal not in arrivals:
             raise InputError(f"{source}: unit {signal}={mapping.unit[signal]}: the log has no column for {signal}")
@@ -183,11 +183,10 @@ def _place(table: Table, signal: str, column: str, rows: NDArray | None = None) 
     return lambda row: table.where(row if rows is None else int(rows[row]), column) + suffix
 
 
-def _signal(table: Table, signal: str, column: str, mapping: SignalMap, bad: BadRows, remarks: list[str]) -> FloatArray:
+def _signal(table: Table, signal: str, column: str, mapping: SignalMap, bad: BadRows) -> FloatArray:
     """A signal (row,) in SI units, NaN in rows that are left out."""
     read = table.readings(column, as_time=signal == "time", as_state=signal == "engaged")
     bad.leave_out(read.faults)
-    remarks += read.remarks
     values = _converted(signal, read.values, mapping)
     outside = check_range(signal, values, _place(table, signal, column), spares=True)
     bad.leave_out(outside)
@@ -208,7 +207,7 @@ def _spare(table: Table, signal: str, signals: dict[str, FloatArray], mapping: S
         return
     rows = BadRows(table.rows)
     try:
-        values = _signal(table, signal, signal, mapping, rows, [])
+        values = _signal(table, signal, signal, mapping, rows)
     except InputError as fault:
         remarks.append(f"{fault}; {signal} is left out")
         return

@@ -1,8 +1,4 @@
-"""Data frames of other libraries as tables, by Arrow's protocol or by the older one for the interchange of data frames.
-
-pyarrow reads both, and is a dependency already: no library of data frames is imported here, and any that speaks one of
-the two will do (pandas, Polars, DuckDB, cuDF, Ibis, Modin).
-"""
+"""Data frames of other libraries as tables, by Arrow's protocol, which pandas, Polars, pyarrow and DuckDB speak."""
 
 from __future__ import annotations
 
@@ -15,25 +11,15 @@ from avtorch.io.tables import Table, with_whole_stamps
 _INDEX = "__index_level_0__"  # pandas' own name for an index without one
 
 
-class ArrowFrame(Protocol):
+class DataFrame(Protocol):
     """A frame with Arrow's PyCapsule interface: pandas from 2.2, Polars from 1.3, pyarrow, DuckDB."""
 
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object: ...
 
 
-class InterchangeFrame(Protocol):
-    """A frame with the interchange protocol of the Consortium for Python Data API Standards."""
-
-    def __dataframe__(self, nan_as_null: bool = False, allow_copy: bool = True) -> Any: ...
-
-
-DataFrame = ArrowFrame | InterchangeFrame
-"""A data frame of any library that speaks one of the two protocols."""
-
-
 def is_dataframe(given: object) -> bool:
-    """Whether it speaks one of the two protocols."""
-    return not isinstance(given, type) and (hasattr(given, "__arrow_c_stream__") or hasattr(given, "__dataframe__"))
+    """Whether it speaks Arrow's protocol."""
+    return not isinstance(given, type) and hasattr(given, "__arrow_c_stream__")
 
 
 def frame_table(frame: DataFrame, source: str = "DataFrame") -> Table:
@@ -47,7 +33,7 @@ def frame_table(frame: DataFrame, source: str = "DataFrame") -> Table:
     import pyarrow as pa
 
     try:
-        table: Any = pa.table(frame) if hasattr(frame, "__arrow_c_stream__") else _interchanged(frame)
+        table: Any = pa.table(frame)
     except (pa.ArrowException, TypeError, ValueError, RuntimeError, NotImplementedError) as fault:
         reason = str(fault).splitlines()[0] if str(fault) else type(fault).__name__
         raise InputError(f"{source}: no columns of numbers can be read from it ({printable(reason, 120)})") from None
@@ -58,12 +44,6 @@ def frame_table(frame: DataFrame, source: str = "DataFrame") -> Table:
     cells = tuple(cells_of(table.column(i), f"{source}: column {quoted(names[i])}") for i in kept)
     both = with_whole_stamps(tuple(names[i] for i in kept), cells)
     return Table(source, *both, form=f"a {type(frame).__name__}")
-
-
-def _interchanged(frame: DataFrame) -> Any:
-    from pyarrow import interchange
-
-    return interchange.from_dataframe(frame)
 
 
 def _is_time(kind: Any) -> bool:

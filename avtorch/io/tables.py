@@ -90,10 +90,10 @@ class Table:
             raise KeyError(f"column {column!r} was not among the wanted ones")
         faults: dict[int, str] = {row: f"{self.where(row)}: {what}" for row, what in self.faults.items()}
         if isinstance(cells, np.ndarray):
-            values, remarks = np.array(cells, dtype=np.float64), ()
+            values = np.array(cells, dtype=np.float64)
             empty = np.zeros(len(values), dtype=bool)
         elif as_time and (first := next((c for c in cells if _is_text(c)), None)) is not None and is_time(first):
-            values, remarks = seconds_of([cell if isinstance(cell, str) else "" for cell in cells])
+            values = seconds_of([cell if isinstance(cell, str) else "" for cell in cells])
             for row in np.flatnonzero(np.isnan(values)).tolist():
                 if row not in faults:
                     faults[row] = f"{self.where(row, column)}: {quoted(str(cells[row]), 30)} is no time"
@@ -101,14 +101,13 @@ class Table:
         else:
             need = _TIME if as_time else "a number is needed"
             values, empty = self._parse(cells, column, empty_is_nan, as_state, faults, need)
-            remarks = ()
         for row in np.flatnonzero(~np.isfinite(values) & ~empty).tolist():
             if row not in faults:
                 word = "NaN" if math.isnan(values[row]) else "infinite"
                 faults[row] = f"{self.where(row, column)}: is {word}; a finite number is needed"
         values[~np.isfinite(values)] = math.nan
         values[list(faults)] = math.nan
-        return Readings(values, faults, remarks)
+        return Readings(values, faults)
 
     def _parse(
         self,
@@ -145,11 +144,10 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """``values`` (row,), NaN where nothing was read; ``faults``: what is wrong with a cell, by row; ``remarks``."""
+    """``values`` (row,), NaN where nothing was read; ``faults``: what is wrong with a cell, by row."""
 
     values: FloatArray
     faults: Mapping[int, str]
-    remarks: tuple[str, ...] = ()
 
 
 _TIME = "a time is needed: a number, or as 2024-04-23 12:31:47.388 or 12:31:47.388"

@@ -25,16 +25,6 @@ def columns(log: Log) -> dict[str, np.ndarray]:
     return {name: values for name in names if (values := getattr(log, name)) is not None}
 
 
-class OnlyInterchange:
-    """A frame of a library that knows the older protocol alone."""
-
-    def __init__(self, table: pa.Table) -> None:
-        self._table = table
-
-    def __dataframe__(self, nan_as_null: bool = False, allow_copy: bool = True) -> Any:
-        return self._table.__dataframe__(nan_as_null, allow_copy)
-
-
 class OnlyArrow:
     """A frame of a library that knows Arrow's protocol alone."""
 
@@ -57,7 +47,6 @@ FRAMES = {
     "pandas": pandas_frame,
     "polars": polars_frame,
     "arrow": pa.table,
-    "interchange": lambda given: OnlyInterchange(pa.table(given)),
     "capsule": lambda given: OnlyArrow(pa.table(given)),
 }
 

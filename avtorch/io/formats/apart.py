@@ -24,14 +24,16 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.io.formats.kinds import PARQUET, Kind
-from avtorch.io.formats.listed import Channel, Listed
+from avtorch.io.formats.listed import Channel, Recording
 from avtorch.io.opening import place
 
 MOST_SECONDS, SECONDS_PER_MIB = 60.0, 1.0
 """For opening, and for each reading, by the size of the file: a workbook of 20 million cells takes a third of that."""
 
 
-def open_apart(path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None = None) -> Listed:
+def open_apart(
+    path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None = None
+) -> Recording:
     """Open a recording in a process of its own; `dbc`: the databases of a CAN log. Raises InputError, also where that
     process ends or takes too long."""
     child = Child(path, kind, dbc)
@@ -42,7 +44,7 @@ def open_apart(path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.
         return {name: Channel(name, clocks[k], child.numbers(len(clocks[k]))) for name, k in answer["channels"]}
 
     listing = child.listing
-    found = Listed(child.source, listing["form"], listing["names"], listing["units"], listing["remarks"], load)
+    found = Recording(child.source, listing["form"], listing["names"], listing["units"], listing["remarks"], load)
     weakref.finalize(found, child.end)
     return found
 

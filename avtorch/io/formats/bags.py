@@ -13,7 +13,7 @@ from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.formats import kinds
 from avtorch.io.formats.bag_types import LAYOUTS
 from avtorch.io.formats.kinds import Kind, guarded, library
-from avtorch.io.formats.listed import Listed, Piece, topic_recording
+from avtorch.io.formats.listed import Piece, Recording, topic_recording
 from avtorch.io.opening import place
 
 _NEED = "an undamaged ROS bag with its index (`rosbag reindex` or `mcap recover` mends one that was cut off)"
@@ -41,7 +41,7 @@ class _Topic:
     fields: tuple[str, ...]
 
 
-def open_file(path: str | os.PathLike[str], kind: Kind) -> Listed:
+def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
     """Open a bag and list its fields from the definitions of its types, without reading a message.
 
     Channels are ``/topic/field/sub``, every numeric field but arrays; their time is the stamp of the message's header

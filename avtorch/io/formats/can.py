@@ -15,7 +15,7 @@ import numpy as np
 from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats import kinds
 from avtorch.io.formats.kinds import Kind, guarded, library, reason
-from avtorch.io.formats.listed import Channel, Listed
+from avtorch.io.formats.listed import Channel, Recording
 from avtorch.io.opening import MOST_BYTES, place, read_regular
 
 _NEED = "an undamaged BLF, ASC or candump log"
@@ -33,7 +33,9 @@ class _Message:
     channels: dict[str, str]
 
 
-def open_file(path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None = None) -> Listed:
+def open_file(
+    path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None = None
+) -> Recording:
     """Open a CAN log with its databases; one pass over the log finds which messages it holds.
 
     Channels are ``Message.Signal``, of those messages that the log holds. Time is that of the log: from its start in
@@ -80,7 +82,7 @@ def open_file(path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.P
             name: Channel(name, *(np.array(x, dtype=np.float64) for x in column)) for name, column in columns.items()
         }
 
-    return Listed(source, kind.words, names, {n: units[n] for n in names if n in units}, frames.remarks, load)
+    return Recording(source, kind.words, names, {n: units[n] for n in names if n in units}, frames.remarks, load)
 
 
 class _Frames:

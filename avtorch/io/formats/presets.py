@@ -107,16 +107,7 @@ CARLA = _preset(
     brake=(Source("/carla/*/vehicle_status/control/brake", "1"),),
 )
 
-OPENACC = _preset(
-    "openacc",
-    "OpenACC (CSV; the star is the vehicle's number; without commands)",
-    time=(Source("Time", "s"),),
-    speed=(Source("SpeedDoppler[0-9]*", "m/s"), Source("Speed[0-9]*", "m/s")),
-    accel=(Source("Accel[0-9]*", "m/s2"),),
-    spacing=(Source("Spacing[0-9]*", "m"), Source("IVS[0-9]*", "m")),
-)
-
 PRESETS: Mapping[str, Preset] = MappingProxyType(
-    {preset.name: preset for preset in (AUTOWARE, APOLLO, OPENPILOT, CARLA, OPENACC)}
+    {preset.name: preset for preset in (AUTOWARE, APOLLO, OPENPILOT, CARLA)}
 )
 """By name, as a command would take it."""

@@ -161,6 +161,5 @@ def test_a_layout_is_found_among_channels() -> None:
     found = PRESETS["autoware"].find(names)
     assert {signal: channel for signal, (channel, _) in found.items()} == {"accel_cmd": names[0], "engaged": names[1]}
     assert found["engaged"][1].when == (1, 3)
-    assert PRESETS["openacc"].find(["Time", "SpeedDoppler3"])["speed"][0] == "SpeedDoppler3"
     assert PRESETS["carla"].find(["/carla/ego_vehicle/vehicle_status/velocity"])["speed"][1].unit == "m/s"
     assert PRESETS["openpilot"].find(names) == {}
