@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 from avtorch.errors import InputError, printable, quoted
 from avtorch.io.formats.parquet import cells_of, is_text, scalar_checks
-from avtorch.io.tables import Table, with_whole_stamps
+from avtorch.io.tables import Table
 
 _INDEX = "__index_level_0__"  # pandas' own name for an index without one
 
@@ -42,8 +42,7 @@ def frame_table(frame: DataFrame, source: str = "DataFrame") -> Table:
         names[names.index(_INDEX)] = "time"
     kept = [i for i in range(len(names)) if _readable(table.column(i).type)]
     cells = tuple(cells_of(table.column(i), f"{source}: column {quoted(names[i])}") for i in kept)
-    both = with_whole_stamps(tuple(names[i] for i in kept), cells)
-    return Table(source, *both, form=f"a {type(frame).__name__}")
+    return Table(source, tuple(names[i] for i in kept), cells, form=f"a {type(frame).__name__}")
 
 
 def _is_time(kind: Any) -> bool:

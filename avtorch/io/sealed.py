@@ -16,9 +16,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
-import stat
 import struct
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -29,7 +27,7 @@ import numpy as np
 
 from avtorch.errors import InputError
 from avtorch.io.answers import atomic, json_text
-from avtorch.io.opening import TooLarge, kind_of, read_regular
+from avtorch.io.opening import TooLarge, read_regular
 
 
 def fingerprint(*parts: Any) -> str:
@@ -106,9 +104,8 @@ class Sealed(NamedTuple):
 def write_sealed(path: Path, content: Any, *, schema: str, of: Mapping[str, Any]) -> None:
     """Write `content` (bytes, or what `json_text` accepts) so that `path` is complete or unchanged.
 
-    `of`: what it belongs to. Raises `InputError` where `path` cannot be written, or is a symlink, a folder, a device.
+    `of`: what it belongs to. Raises `InputError` where `path` cannot be written.
     """
-    _free_or_regular(path)
     if isinstance(content, bytes):
         line = json_text({"of": of, "bytes": len(content)}, indent=None, ascii_only=True)
         rest = line[1:].encode() + b"\n" + content
@@ -174,15 +171,6 @@ def _parsed(text: bytes, path: Path, schema: str, key: str, remedy: str) -> dict
 
 def _no_number(text: str) -> NoReturn:
     raise ValueError(text)
-
-
-def _free_or_regular(path: Path) -> None:
-    try:
-        kind = os.lstat(path).st_mode
-    except (OSError, ValueError):
-        return  # no file yet; the writer reports any other fault
-    if not stat.S_ISREG(kind):
-        raise InputError(f"{path}: is {kind_of(kind)}; a regular file or a free name is needed")
 
 
 def _refuse(path: Path, what: str, remedy: str) -> NoReturn:

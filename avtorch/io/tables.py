@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats.apart import parquet_apart
+from avtorch.io.formats.parquet import Cells
 from avtorch.io.formats.parquet import cells_of as arrow_cells
 from avtorch.io.opening import MOST_BYTES, MOST_CELLS, MOST_COLUMNS, beginning, place, read_regular
 from avtorch.io.text import decoded, is_time, layout_of, rows_of, seconds_of, unzipped
@@ -33,15 +34,16 @@ Wanted = Callable[[tuple[str, ...]], Collection[str]]
 class Table:
     """Named columns of one file, cells not yet parsed as numbers; None for a column that was not requested.
 
-    Messages name rows as ``row 3 (line 4)``: the third row of data, and the line an editor shows. A Parquet file
-    and arrays have no lines. ``decimal`` is the mark in cells of text; ``units`` are those of a row of units, by
-    column; ``faults``: rows that are no rows, such as one cut off, with what is wrong; ``remarks``: what was guessed;
-    ``form``: the file's format in words.
+    A stamp in two columns, of seconds and of nanoseconds, is one column more (`whole_stamps`). Messages name rows as
+    ``row 3 (line 4)``: the third row of data, and the line an editor shows. A Parquet file and arrays have no lines.
+    ``decimal`` is the mark in cells of text; ``units`` are those of a row of units, by column; ``faults``: rows that
+    are no rows, such as one cut off, with what is wrong; ``remarks``: what was guessed; ``form``: the file's format in
+    words.
     """
 
     source: str
     names: tuple[str, ...]
-    cells: tuple[Sequence[Any] | NDArray | None, ...]
+    cells: tuple[Cells | None, ...]
     lines: Sequence[int] | None = None
     decimal: str = "."
     units: Mapping[str, str] = field(default_factory=dict)
@@ -51,6 +53,11 @@ class Table:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "source", place(self.source))
+        cells = dict(zip(self.names, self.cells, strict=True))
+        for name, halves in whole_stamps(self.names).items():
+            if name not in cells:
+                object.__setattr__(self, "names", (*self.names, name))
+                object.__setattr__(self, "cells", (*self.cells, _whole(*(cells[half] for half in halves))))
 
     @property
     def rows(self) -> int:
@@ -186,7 +193,7 @@ def read_table(path: str | os.PathLike[str], *, wanted: Wanted | None = None) ->
     512 MiB, 10,000 columns, 1,000,000 characters in a row, or 20 million cells in the wanted columns.
     """
     file = Path(path)
-    wanted = None if wanted is None else with_halves(wanted)
+    wanted = None if wanted is None else _with_halves(wanted)
     if beginning(file, 4, need=_NEED) == b"PAR1":
         return _parquet(file, wanted)
     raw = read_bytes(file)
@@ -202,7 +209,7 @@ def _parquet(file: Path, wanted: Wanted | None) -> Table:
         name: arrow_cells(columns.column(name), f"{place(file)}: column {quoted(name)}")
         for name in columns.column_names
     }
-    return Table(place(file), *with_whole_stamps(names, [read.get(name) for name in names]), form="Parquet")
+    return Table(place(file), names, tuple(read.get(name) for name in names), form="Parquet")
 
 
 def read_bytes(file: Path) -> bytes:
@@ -237,8 +244,7 @@ def text_table(source: str, text: str, wanted: Wanted | None) -> Table:
     read = dict(zip(kept, columns, strict=True))
     cells = tuple(read.get(i) for i in range(len(names)))
     form = f"text, {layout.words}"
-    both = with_whole_stamps(names, cells)
-    return Table(source, *both, lines, decimal=layout.decimal, units=units, faults=faults, form=form)
+    return Table(source, names, cells, lines, decimal=layout.decimal, units=units, faults=faults, form=form)
 
 
 def _names(source: str, found: tuple[list[str], int] | None) -> tuple[str, ...]:
@@ -281,7 +287,7 @@ def whole_stamps(names: Collection[str]) -> dict[str, tuple[str, str]]:
     return found
 
 
-def with_halves(wanted: Callable[[tuple[str, ...]], Collection[str]]) -> Callable[[tuple[str, ...]], Collection[str]]:
+def _with_halves(wanted: Wanted) -> Wanted:
     """What is wanted of a file's columns, with both columns of a stamp that is."""
 
     def chosen(names: tuple[str, ...]) -> set[str]:
@@ -291,20 +297,11 @@ def with_halves(wanted: Callable[[tuple[str, ...]], Collection[str]]) -> Callabl
     return chosen
 
 
-def with_whole_stamps(
-    names: Sequence[str], cells: Sequence[Sequence[Any] | NDArray | None]
-) -> tuple[tuple[str, ...], tuple[Sequence[Any] | NDArray | None, ...]]:
-    """The `names` and `cells` of a table's columns, with a column of text for each stamp in two: the digits side by
-    side, None where its columns were not read."""
-    whole = list(cells)
-    found = whole_stamps(names)
-    for halves in found.values():
-        seconds, nanoseconds = (cells[names.index(half)] for half in halves)
-        if seconds is None or nanoseconds is None:
-            whole.append(None)
-        else:
-            whole.append([_stamp(str(a).strip(), str(b).strip()) for a, b in zip(seconds, nanoseconds, strict=True)])
-    return (*names, *found), tuple(whole)
+def _whole(seconds: Cells | None, nanoseconds: Cells | None) -> Cells | None:
+    """Texts of both, the digits side by side; None where they were not read."""
+    if seconds is None or nanoseconds is None:
+        return None
+    return [_stamp(str(a).strip(), str(b).strip()) for a, b in zip(seconds, nanoseconds, strict=True)]
 
 
 def _stamp(seconds: str, nanoseconds: str) -> str:

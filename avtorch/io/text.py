@@ -11,6 +11,7 @@ m/s², ° or an umlaut wrongly. So text that is not Unicode is read as Windows-1
 from __future__ import annotations
 
 import csv
+import gzip
 import io
 import re
 import zlib
@@ -71,30 +72,22 @@ def _offset(zone: str | None) -> float:
 
 
 _BINARY = re.compile(rb"[\x00-\x08\x0b\x0e-\x1a\x1c-\x1f]")
-_PIECE = 2**20
 
 
 def unzipped(source: str, raw: bytes) -> bytes:
     """`raw`, or what it holds if it is gzip. Raises InputError for a damaged one, and beyond `MOST_BYTES`."""
     if not raw.startswith(b"\x1f\x8b"):
         return raw
-    pieces, size, rest = [], 0, raw
     try:
-        while rest.startswith(b"\x1f\x8b"):  # several may follow each other
-            part = zlib.decompressobj(wbits=31)
-            while not part.eof:
-                piece = part.decompress(rest, _PIECE)
-                rest = part.unconsumed_tail
-                pieces.append(piece)
-                size += len(piece)
-                if size > MOST_BYTES:
-                    raise InputError(f"{source}: holds over {MOST_BYTES:,} bytes; {MOST_BYTES:,} at most are needed")
-                if not piece and not rest and not part.eof:
-                    raise InputError(f"{source}: ends inside its gzip data; the whole file is needed")
-            rest = part.unused_data
-    except zlib.error:
+        with gzip.open(io.BytesIO(raw)) as stream:
+            content = stream.read(MOST_BYTES + 1)
+    except EOFError:
+        raise InputError(f"{source}: ends inside its gzip data; the whole file is needed") from None
+    except (OSError, zlib.error):
         raise InputError(f"{source}: damaged gzip data; write the file anew") from None
-    return b"".join(pieces)
+    if len(content) > MOST_BYTES:
+        raise InputError(f"{source}: holds over {MOST_BYTES:,} bytes; {MOST_BYTES:,} at most are needed")
+    return content
 
 
 def decoded(source: str, raw: bytes) -> tuple[str, tuple[str, ...]]:

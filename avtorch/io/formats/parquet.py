@@ -38,27 +38,34 @@ def scalar_checks() -> tuple[Callable[[Any], bool], ...]:
     return *numbers, types.is_timestamp, types.is_duration
 
 
-def cells_of(column: Any, where: str) -> Cells:
-    """The cells of a column; a time stamp brings its own unit and becomes seconds since its epoch."""
+def short_texts(column: Any, where: str) -> Any:
+    """A column without Arrow's dictionary. InputError where its texts are too long for numbers."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    column = column.combine_chunks()
-    if isinstance(column, pa.ChunkedArray):  # of several chunks that do not fit into one
-        column = pa.concat_arrays(column.chunks)
     if pa.types.is_dictionary(column.type):
-        if is_text(column.type.value_type):
-            lengths = pc.binary_length(column.dictionary)  # pyright: ignore[reportAttributeAccessIssue]
-            longest = max((n or 0 for n in lengths.to_pylist()), default=0)
-            if longest > MOST_TEXT:
-                raise InputError(f"{where}: holds texts of {longest:,} bytes; numbers are needed")
-        column = column.dictionary_decode()
+        texts = [chunk.dictionary for chunk in column.chunks] if is_text(column.type.value_type) else []
+    else:
+        texts = [column] if is_text(column.type) else []
+    for text in texts:
+        longest = pc.max(pc.binary_length(text)).as_py() or 0  # pyright: ignore[reportAttributeAccessIssue]
+        if longest > MOST_TEXT:
+            raise InputError(f"{where}: holds texts of {longest:,} bytes; numbers are needed")
+    return column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
+
+
+def cells_of(column: Any, where: str) -> Cells:
+    """The cells of a column; a time stamp brings its own unit and becomes seconds since its epoch."""
+    import pyarrow as pa
+
+    if pa.types.is_dictionary(column.type):
+        column = short_texts(column, where)
     kind = column.type
     if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
         ticks = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[kind.unit]
         return [None if x is None else x / ticks for x in column.cast(pa.int64()).to_pylist()]
     if column.null_count == 0 and (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-        return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
+        return np.asarray(column.to_numpy(), dtype=np.float64)
     # text, booleans, decimals and empty cells go through the same careful reading as a CSV
     return column.to_pylist()
 
@@ -90,7 +97,6 @@ class ParquetFile:
 
     def _table(self, wanted: Collection[str]) -> Any:
         import pyarrow as pa
-        import pyarrow.compute as pc
 
         count, rows, schema = Counter(self.names), self._file.metadata.num_rows, self._file.schema_arrow
         kept = [name for name in self.names if name in wanted and count[name] == 1]
@@ -109,17 +115,10 @@ class ParquetFile:
         found = self._file.read(columns=kept, use_threads=False)
         if kept and found.num_rows != rows:
             raise ValueError(f"{found.num_rows} rows where it declares {rows}")
-        columns = []
-        for name in kept:
-            column = found.column(found.schema.get_field_index(name))
-            if pa.types.is_dictionary(column.type):
-                column = column.cast(column.type.value_type)
-            if is_text(column.type):
-                longest = pc.max(pc.binary_length(column)).as_py() or 0  # pyright: ignore[reportAttributeAccessIssue]
-                if longest > MOST_TEXT:
-                    where = f"{self.source}: column {quoted(name)}"
-                    raise InputError(f"{where}: holds texts of {longest:,} bytes; numbers are needed")
-            columns.append(column)
+        columns = [
+            short_texts(found.column(found.schema.get_field_index(name)), f"{self.source}: column {quoted(name)}")
+            for name in kept
+        ]
         table = pa.table(columns, names=kept)
         table.validate(full=True)
         return table
