@@ -18,15 +18,13 @@ from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError, quoted
 from avtorch.io.answers import atomic
-from avtorch.io.assemble import assemble
+from avtorch.io.assemble import Arrivals, assemble, merged
 from avtorch.io.clock import median_step, since_start, stretches
-from avtorch.io.dataframe import DataFrame, frame_table, is_dataframe
 from avtorch.io.engagement import settled_rows
 from avtorch.io.formats import is_recording, open_recording
 from avtorch.io.mapping import PEDALS, SIGNALS, Pairs, SignalMap, given_mapping, pairs, read_mapping
-from avtorch.io.merge import Arrivals, merged
 from avtorch.io.opening import place
-from avtorch.io.tables import Table, read_table
+from avtorch.io.tables import DataFrame, Table, frame_table, is_dataframe, read_table
 from avtorch.io.units import SI
 from avtorch.io.validity import check_units
 
@@ -165,7 +163,7 @@ class Log(Displayed):
     ) -> Log:
         """A log from a data frame of pandas, Polars, pyarrow or DuckDB, checked as a file is; options as in `read`.
 
-        A named index is a column; an index of times without a name is ``time`` (`avtorch.io.dataframe`).
+        A named index is a column; an index of times without a name is ``time`` (`avtorch.io.tables`).
         """
         mapping = given_mapping(SignalMap(), map=map, unit=unit, stamp=stamp, state=state)
         return cls._of(frame_table(frame, name), mapping, following=following)

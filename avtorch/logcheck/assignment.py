@@ -17,13 +17,13 @@ from itertools import product
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.io.assemble import held, merged
 from avtorch.io.formats.listed import Recording
 from avtorch.io.formats.presets import PRESETS, Preset, Source
-from avtorch.io.merge import held, merged
 from avtorch.io.tables import Table, whole_stamps
 from avtorch.io.validity import DELAYS_S, MIN_SPANS, MOST_BAD, SPANS_S, codes, integral
-from avtorch.logcheck.recorder import lateness
-from avtorch.logcheck.vocabulary import Header, bare_unit, header_of, likeness, means_otherwise, signals_named
+from avtorch.logcheck.recorder import lateness, slope_of
+from avtorch.logcheck.vocabulary import NAMED_SIGNALS, Header, bare_unit, header_of, likeness, means_otherwise
 
 _MOST = 5  # columns that are tried for a signal
 _KNOWN = 3.0  # likeness of a column of a known layout
@@ -45,6 +45,11 @@ class Column:
     def name(self) -> str:
         return self.header.name
 
+    @property
+    def by_what(self) -> str:
+        """What tells which signal it is."""
+        return f"by the layout of {self.layout}" if self.layout else "by its name"
+
 
 def columns_of(table: Table) -> list[Column]:
     """The columns of a table that hold numbers or times, but for a twentieth of their cells."""
@@ -57,7 +62,7 @@ def columns_of(table: Table) -> list[Column]:
         layout = {signal: source for signal, (column, source) in known.items() if column == name}
         unit = next((source.unit for source in layout.values() if source.unit), None)
         header = header_of(name, unit or table.units.get(name))
-        alike = {signal: x for signal in signals_named() if (x := likeness(header, signal)) > 0 and signal not in known}
+        alike = {signal: x for signal in NAMED_SIGNALS if (x := likeness(header, signal)) > 0 and signal not in known}
         alike |= dict.fromkeys(layout, _KNOWN)
         alike |= dict.fromkeys(("time",) if name in stamps else (), _STAMP)
         read = table.readings(name, empty_is_nan=True, as_time="time" in alike, as_state=True)
@@ -77,7 +82,7 @@ def table_of(recording: Recording) -> Table:
     named: dict[str, list[str]] = {signal: [channel] for signal, (channel, _) in known.items() if signal != "time"}
     for name in recording.names:
         header = header_of(name, recording.units.get(name))
-        for signal in signals_named():
+        for signal in NAMED_SIGNALS:
             if signal not in known and signal != "time" and likeness(header, signal) > 0:
                 named.setdefault(signal, []).append(name)
     ranked_names = {
@@ -100,10 +105,10 @@ def table_of(recording: Recording) -> Table:
 def layout_of(names: Iterable[str]) -> tuple[Preset | None, dict[str, tuple[str, Source]]]:
     """The known layout of a log with columns `names`: one that has a command and a response; nothing otherwise."""
     there = tuple(names)
-    for preset in PRESETS.values():
+    for preset in PRESETS:
         found = preset.find(there)
         if "accel_cmd" in found and ("speed" in found or "accel" in found):
-            return preset, {signal: one for signal, one in found.items() if signal in signals_named()}
+            return preset, {signal: one for signal, one in found.items() if signal in NAMED_SIGNALS}
     return None, {}
 
 
@@ -187,7 +192,7 @@ def assign(clock: FloatArray, parts: list[slice], columns: list[Column], given: 
             )
             continue
         found[signal] = column
-        reasons[signal] = _reasons(signal, column, best, options[signal], motion, signal in given)
+        reasons[signal] = _reasons(signal, column, best, motion, signal in given)
     return Assigned(found, reasons, doubts)
 
 
@@ -348,9 +353,7 @@ def _comes_first(column: Column, others: Mapping[str, list[Column]], motion: _Mo
     clock = motion.clock
     for name, columns in others.items():
         for other in columns[:1]:
-            y = filled(other)
-            if name == "speed":
-                y = np.interp(clock + 0.25, clock, y) - np.interp(clock - 0.25, clock, y)
+            y = slope_of(clock, filled(other)) if name == "speed" else filled(other)
             late = lateness(clock, motion.parts, filled(column), y)
             if late is not None and late.correlation > 0.5 and late.seconds <= 0:
                 return False
@@ -409,9 +412,7 @@ def _with(signal: str, column: Column, of: Mapping[str, Column | None], motion: 
     return f"correlation {r:.2f} with {next(name for name in names if name != signal)}"
 
 
-def _reasons(
-    signal: str, column: Column, best: Mapping[str, Column | None], options: list[Column], motion: _Motion, given: bool
-) -> list[str]:
+def _reasons(signal: str, column: Column, best: Mapping[str, Column | None], motion: _Motion, given: bool) -> list[str]:
     if given:
         return ["as given"]
     if signal not in column.likeness:
@@ -421,15 +422,7 @@ def _reasons(
             "accel_cmd": "the car's motion follows it",
         }[signal]
         return [f"no name tells; {words} (correlation {abs(motion.strength(signal, column, best)):.2f})"]
-    reasons = [f"by the layout of {column.layout}" if column.layout else "by its name"]
-    others = [
-        c.name
-        for c in options
-        if c is not column
-        and c.likeness.get(signal, 0.0) > 0.9 * column.likeness[signal]
-        and motion.same(signal, column, c)
-    ]
-    return [*reasons, f"as well as {', '.join(others)}"] if others else reasons
+    return [column.by_what]
 
 
 def _one_sided(values: FloatArray) -> bool:

@@ -71,6 +71,9 @@ def bare_unit(header: Header, signal: str) -> str | None:
     return last if last is not None and signal in _BARE.get(last, {signal}) else None
 
 
+_TIME = {
+    "time", "timestamp", "t", "stamp", "zeit", "zeitstempel", "secs", "seconds", "elapsed", "clock", "datetime",
+}  # fmt: skip
 _ACCEL = {"accel", "acceleration", "beschl", "beschleunigung", "acc", "ax", "along", "alon", "a", "accx"}
 _SPEED = {"speed", "veloc", "velocity", "geschw", "geschwindigkeit", "vitesse", "v", "vx", "spd", "vel", "vlon"}
 _COMMAND = {
@@ -117,21 +120,7 @@ class _Wanted:
 
 _SIGNALS: dict[str, _Wanted] = {
     "time": _Wanted(
-        (
-            {
-                "time",
-                "timestamp",
-                "t",
-                "stamp",
-                "zeit",
-                "zeitstempel",
-                "secs",
-                "seconds",
-                "elapsed",
-                "clock",
-                "datetime",
-            },
-        ),
+        (_TIME,),
         {"gap", "headway", "collision", "ttc", "lag", "delay", "constant", "gps", "nsec", "nsecs", "nanosec"},
         {"sent", "receive", "header"},
     ),
@@ -169,6 +158,8 @@ _SIGNALS: dict[str, _Wanted] = {
         {"time", "distance", "speed", "length", "driver", "drivetrain", "brake", "override", "mode", "torque", "count"},
     ),
 }
+NAMED_SIGNALS = tuple(_SIGNALS)
+"""Signals that a name may be recognised as."""
 _STEM = 4  # letters from which a word may begin with a wanted one, such as `acceleration` with `accel`
 
 
@@ -206,11 +197,6 @@ def is_answer(header: Header) -> bool:
 def is_asked(header: Header) -> bool:
     """Whether a name says that it was commanded."""
     return any(word in _COMMAND or _begins(word, _COMMAND) for word in header.words)
-
-
-def signals_named() -> tuple[str, ...]:
-    """Signals that a name may be recognised as."""
-    return tuple(_SIGNALS)
 
 
 def _begins(word: str, group: Collection[str]) -> bool:

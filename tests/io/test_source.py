@@ -12,7 +12,7 @@ import pytest
 from avtorch import GLVDPlant, Leader, Log, check, compare, diagnose, estimate, simulate
 from avtorch.errors import InputError
 from avtorch.io import as_log, as_logs
-from avtorch.io.dataframe import frame_table
+from avtorch.io.tables import frame_table
 
 
 @pytest.fixture(scope="module")

@@ -31,12 +31,9 @@ MOST_SECONDS, SECONDS_PER_MIB = 60.0, 1.0
 """For opening, and for each reading, by the size of the file: a workbook of 20 million cells takes a third of that."""
 
 
-def open_apart(
-    path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None = None
-) -> Recording:
-    """Open a recording in a process of its own; `dbc`: the databases of a CAN log. Raises InputError, also where that
-    process ends or takes too long."""
-    child = Child(path, kind, dbc)
+def open_apart(path: str | os.PathLike[str], kind: Kind) -> Recording:
+    """Open a recording in a process of its own. Raises InputError, also where that process ends or takes too long."""
+    child = Child(path, kind)
 
     def load(names: tuple[str, ...]) -> dict[str, Channel]:
         answer = child.ask(names)
@@ -58,7 +55,7 @@ def parquet_apart(
     """
     import pyarrow as pa
 
-    child = Child(path, PARQUET, None)
+    child = Child(path, PARQUET)
     try:
         names = tuple(child.listing["names"])
         answer = child.ask(tuple(names if wanted is None else wanted(names)))
@@ -71,7 +68,7 @@ class Child:
     """The other process: requests are lines of JSON, answers are a line of JSON and the numbers it tells of. `listing`
     is its first answer."""
 
-    def __init__(self, path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None) -> None:
+    def __init__(self, path: str | os.PathLike[str], kind: Kind) -> None:
         self.source, self._words = place(path), kind.words
         self._seconds = MOST_SECONDS + SECONDS_PER_MIB * _size(path) / 2**20
         self._late = False
@@ -80,10 +77,9 @@ class Child:
         # a trace of a panic, which nobody sees, takes most of a second
         environment = dict(os.environ, RUST_BACKTRACE="0")
         environment["PYTHONPATH"] = os.pathsep.join(part for part in sys.path if part)
-        databases = [] if dbc is None else ["--dbc", *(os.fspath(base) for base in dbc)]
         try:
             self._process = subprocess.Popen(
-                [*command, kind.words, os.fspath(path), *databases],
+                [*command, kind.words, os.fspath(path)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
