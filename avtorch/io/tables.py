@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.arrays import FloatArray
-from avtorch.errors import InputError, listed, printable, quoted
+from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats.apart import parquet_apart
-from avtorch.io.formats.parquet import Cells, is_text, scalar_checks
+from avtorch.io.formats.kinds import reason
+from avtorch.io.formats.parquet import Cells, readable
 from avtorch.io.formats.parquet import cells_of as arrow_cells
+from avtorch.io.formats.parquet import is_time as is_time_type
 from avtorch.io.opening import MOST_BYTES, MOST_CELLS, MOST_COLUMNS, beginning, place, read_regular
 from avtorch.io.text import decoded, is_time, layout_of, rows_of, seconds_of, unzipped
 from avtorch.numeral import numeral
@@ -338,25 +340,10 @@ def frame_table(frame: DataFrame, source: str = "DataFrame") -> Table:
     try:
         table: Any = pa.table(frame)
     except (pa.ArrowException, TypeError, ValueError, RuntimeError, NotImplementedError) as fault:
-        reason = str(fault).splitlines()[0] if str(fault) else type(fault).__name__
-        raise InputError(f"{source}: no columns of numbers can be read from it ({printable(reason, 120)})") from None
+        raise InputError(f"{source}: no columns of numbers can be read from it ({reason(fault)})") from None
     names = [str(name) for name in table.column_names]
-    if _INDEX in names and "time" not in names and _is_time(table.column(names.index(_INDEX)).type):
+    if _INDEX in names and "time" not in names and is_time_type(table.column(names.index(_INDEX)).type):
         names[names.index(_INDEX)] = "time"
-    kept = [i for i in range(len(names)) if _readable(table.column(i).type)]
+    kept = [i for i in range(len(names)) if readable(table.column(i).type)]
     cells = tuple(arrow_cells(table.column(i), f"{source}: column {quoted(names[i])}") for i in kept)
     return Table(source, tuple(names[i] for i in kept), cells, form=f"a {type(frame).__name__}")
-
-
-def _is_time(kind: Any) -> bool:
-    from pyarrow import types
-
-    return types.is_timestamp(kind) or types.is_duration(kind)
-
-
-def _readable(kind: Any) -> bool:
-    from pyarrow import types
-
-    if types.is_dictionary(kind):
-        kind = kind.value_type
-    return is_text(kind) or any(check(kind) for check in scalar_checks())

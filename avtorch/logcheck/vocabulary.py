@@ -175,7 +175,7 @@ def likeness(header: Header, signal: str) -> float:
 
 def _likeness(words: tuple[str, ...], wanted: _Wanted) -> float:
     both = (*words, *(a + b for a, b in pairwise(words)))
-    if not words or any(_holds(both, group) is None for group in wanted.groups):
+    if not words or not all(_holds(both, group) for group in wanted.groups):
         return 0.0
     if any(word in wanted.not_ or _begins(word, wanted.not_) for word in words):
         return 0.0
@@ -203,12 +203,9 @@ def _begins(word: str, group: Collection[str]) -> bool:
     return any(len(stem) >= _STEM and word.startswith(stem) for stem in group)
 
 
-def _holds(words: Collection[str], group: Collection[str]) -> str | None:
-    """The word that is one of the group, or begins or ends with one that is long enough."""
-    for word in words:
-        if word in group:
-            return word
-        for stem in group:
-            if len(stem) >= _STEM and (word.startswith(stem) or word.endswith(stem)):
-                return word
-    return None
+def _holds(words: Collection[str], group: Collection[str]) -> bool:
+    """Whether a word is one of the group, or begins or ends with one that is long enough."""
+    return any(
+        word in group or any(len(stem) >= _STEM and (word.startswith(stem) or word.endswith(stem)) for stem in group)
+        for word in words
+    )
