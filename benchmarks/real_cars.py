@@ -34,7 +34,7 @@ def cars(folder: Path) -> list[tuple[Path, int]]:
     for path in sorted(folder.glob("openacc_*/*.csv")):
         if path.stem == "Slope":
             continue
-        names = read_table(path, header="Time").names
+        names = read_table(path).names
         stem = "SpeedDoppler" if any(n.startswith("SpeedDoppler") for n in names) else "Speed"
         numbers = numbered(stem, names)
         gap = "Spacing{}" if stem == "SpeedDoppler" else "IVS{}"
@@ -105,7 +105,7 @@ def main() -> None:
             continue
         row = row_of(found, log)
         if given.slope and "astazero" in str(path):
-            table = read_table(path, header="Time")
+            table = read_table(path)
             keep = np.isin(table.numbers("Time"), log.time)
             survey = read_table(path.parent / "Slope.csv")
             positions = table.numbers(f"X{number}")[keep]

@@ -25,7 +25,7 @@ from typing import Any, Literal
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.answer_set import is_of_answer
 from avtorch.io.formats import is_recording
-from avtorch.io.mapping import mapping_beside, mapping_place, read_mapping
+from avtorch.io.mapping import mapping_beside, mapping_place
 from avtorch.io.opening import TooLarge, kind_of, place, read_regular
 
 INSTALL = "pip install 'avtorch[fleet]'"
@@ -135,12 +135,6 @@ def content_hash(log: Path) -> tuple[str, int]:
 def _beside(log: Path) -> list[Path]:
     mapping = mapping_beside(log)
     found = [] if mapping is None or not mapping.is_file() else [mapping]
-    if found:
-        try:
-            named = {one.file for one in read_mapping(log).elsewhere.values()}
-        except InputError:  # said when the log is read
-            named = set()
-        found += [file for name in sorted(named) if (file := log.parent / name).is_file()]
     if log.suffix.lower() in _CAN and log.is_file():
         found += sorted(p for p in log.parent.glob("*.dbc") if p.is_file())
     return found

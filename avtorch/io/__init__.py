@@ -13,10 +13,10 @@ Example:
 
 from avtorch.io.answer_set import answer_set, read_answer
 from avtorch.io.answers import atomic, write_json
+from avtorch.io.assemble import held
 from avtorch.io.folder_lock import sole_use
 from avtorch.io.leaders import RawLeader, read_following, read_leader
 from avtorch.io.log import STANDSTILL_MPS, Log, LogSource, as_log, as_logs
-from avtorch.io.merge import held
 from avtorch.io.quality import Gap, Quality, check
 from avtorch.io.sealed import Damaged, Sealed, fingerprint, read_sealed, read_sealed_bytes, write_sealed
 

@@ -11,7 +11,6 @@ import hashlib
 import json
 import os
 import shutil
-import stat
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -139,11 +138,8 @@ def _prepared(place: Path, staged: Path, names: Sequence[str]) -> list[str]:
     if foreign := set(files) - set(names):
         raise ValueError(f"{place}: {', '.join(sorted(foreign))} written, needs names out of {', '.join(names)}")
     for name in names:
-        kind = _kind(place / name)
-        if stat.S_ISDIR(kind):
+        if (place / name).is_dir() and not (place / name).is_symlink():
             raise InputError(f"{place / name}: is a directory; the name of a file is needed")
-        if kind and not (stat.S_ISREG(kind) or stat.S_ISLNK(kind)):
-            raise InputError(f"{place / name}: is no regular file; the name of a file is needed")
     main, others = names[0], [name for name in files if name != names[0]]
     if main in files and main.endswith(".json") and others:
         answer = json.loads((staged / main).read_text(encoding="utf-8"))
@@ -168,11 +164,3 @@ def _remove_leftovers(place: Path) -> None:
     for left in place.glob(f"{_STAGE}*"):
         if not any(one.name == left.name for one in _staged):
             shutil.rmtree(left, ignore_errors=True)
-
-
-def _kind(path: Path) -> int:
-    """Kind of a file, of a link itself; 0 where there is none."""
-    try:
-        return os.lstat(path).st_mode
-    except FileNotFoundError:
-        return 0

@@ -1,11 +1,13 @@
-"""From a table and a mapping to the signals of a log: find, convert, check, and merge onto one clock."""
+"""From a table or a recording, and a mapping, to the signals of a log: find, convert, check, and merge onto one clock.
+
+Signals that come with their own time stamps are held, never interpolated. Channels of a recording become one table on
+the clock of the fastest of them, and what arrives beside it.
+"""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +15,108 @@ from numpy.typing import NDArray
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.clock import clock_words, gap_limit, median_step, since, since_start
+from avtorch.io.formats.listed import Channel, Recording
 from avtorch.io.mapping import PEDALS, SIGNALS, SignalMap
-from avtorch.io.merge import Arrivals, held
-from avtorch.io.tables import Table, read_table
+from avtorch.io.tables import Table
 from avtorch.io.units import stated_unit, to_si
-from avtorch.io.validity import MOST_BAD, BadRows, check_range, check_rate, check_time, disordered, off_clock, stray
+from avtorch.io.validity import RATE_HZ, BadRows, check_range, check_rate, check_time, time_faults
 
-_NAME = 40  # characters of the longest column name that may be a signal's, mistyped
+
+def held(clock: FloatArray, stamps: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The last value that had arrived at each tick of ``clock``, and its age [s].
+
+    ``clock`` is ``(time,)``, ``stamps`` and ``values`` are ``(message,)``, stamps strictly rising; both answers are
+    ``(time,)``. Before the first message there is nothing to hold: value NaN, age infinite. Interpolating instead would
+    let a value act before it was measured. Raises InputError for stamps that do not rise.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.io import held
+        >>> clock, stamps, commands = np.array([0.0, 0.1, 0.2]), np.array([0.05, 0.18]), np.array([1.0, 2.0])
+        >>> value, age = held(clock, stamps, commands)
+        >>> value.tolist(), age.round(2).tolist()
+        ([nan, 1.0, 2.0], [inf, 0.05, 0.02])
+    """
+    if len(stamps) != len(values):
+        raise InputError(f"stamps: {len(stamps)} of them for {len(values)} values; one each is needed")
+    if len(stamps) == 0:
+        raise InputError("stamps: none given; a signal needs at least one value")
+    if np.any(np.diff(stamps) <= 0):
+        message = int(np.argmax(np.diff(stamps) <= 0)) + 1
+        raise InputError(
+            f"stamps: message {message + 1} has {stamps[message]:g} s after {stamps[message - 1]:g} s; they must rise"
+        )
+    last = np.searchsorted(stamps, clock, side="right") - 1
+    known = last >= 0
+    at = np.maximum(last, 0)
+    return np.where(known, values[at], np.nan), np.where(known, clock - stamps[at], np.inf)
+
+
+Arrivals = dict[str, tuple[FloatArray, FloatArray]]
+"""Stamps and values (message,) by signal."""
+_CLOCKS = ("accel_cmd", "accel", "speed")
+_CLOCK = "time"
+
+
+def merged(recording: Recording, columns: Mapping[str, str]) -> tuple[Table, Arrivals]:
+    """The channels `columns` (by signal) of a recording: a table of those on its clock, and arrivals of the others.
+
+    The clock is that of the fastest of command, acceleration and speed; one of over 200 Hz is thinned out. Raises
+    `InputError` for a recording that has none of them.
+    """
+    wanted = {signal: name for signal, name in columns.items() if name in recording.names}
+    channels = recording.read(set(wanted.values()))
+    clean = {signal: _clean(channels[name]) for signal, name in wanted.items()}
+    clean = {signal: pair for signal, pair in clean.items() if len(pair[0])}
+    clocks = [clean[signal][0] for signal in _CLOCKS if signal in clean and len(clean[signal][0]) > 1]
+    if not clocks:
+        there = ", ".join(wanted) or "none"
+        raise InputError(
+            f"{recording.source}: found {there} of accel_cmd, accel and speed with two samples or more; needs one"
+        )
+    clock = _thinned(min(clocks, key=lambda time: float(np.median(np.diff(time)))))
+    cells: dict[str, FloatArray] = {_CLOCK: clock}
+    arrivals: Arrivals = {}
+    for signal, (time, values) in clean.items():
+        if len(time) == len(clock) and np.array_equal(time, clock):
+            cells[columns[signal]] = values
+        else:
+            arrivals[signal] = time, values
+    names = (_CLOCK, *(name for name in recording.names if name != _CLOCK))
+    return (
+        Table(
+            recording.source,
+            names,
+            tuple(cells.get(name) for name in names),
+            units={columns[signal]: unit for signal, unit in _units(recording, wanted).items()},
+            remarks=tuple(recording.remarks),
+            form=recording.form,
+        ),
+        arrivals,
+    )
+
+
+def _units(recording: Recording, wanted: Mapping[str, str]) -> dict[str, str]:
+    return {signal: recording.units[name] for signal, name in wanted.items() if name in recording.units}
+
+
+def _clean(channel: Channel) -> tuple[FloatArray, FloatArray]:
+    """Stamps that rise, and their values: of samples with one stamp the last counts."""
+    known = np.isfinite(channel.time) & np.isfinite(channel.values)
+    time, values = channel.time[known], channel.values[known]
+    if (np.diff(time) <= 0).any():
+        order = np.argsort(time, kind="stable")
+        time, values = time[order], values[order]
+        last = np.concatenate([np.diff(time) > 0, [True]])
+        time, values = time[last], values[last]
+    return time, values
+
+
+def _thinned(time: FloatArray) -> FloatArray:
+    rate = 1.0 / float(np.median(np.diff(time)))
+    return time if rate <= 1.05 * RATE_HZ[1] else time[:: int(np.ceil(rate / RATE_HZ[1] - 1e-6))]
+
+
 # change of speed that an accelerometer in order notices: 1 m/s, and a tenth of the speed of what is slower
 _DEAD_MPS, _DEAD_SHARE = 1.0, 0.1
 
@@ -34,15 +131,13 @@ class Assembled:
     remarks: tuple[str, ...]
 
 
-def assemble(
-    table: Table, mapping: SignalMap, *, folder: Path, following: bool, arrived: Arrivals | None = None
-) -> Assembled:
+def assemble(table: Table, mapping: SignalMap, *, following: bool, arrived: Arrivals | None = None) -> Assembled:
     """Find, convert, check and merge the signals of a log.
 
-    ``folder`` is where other files named in the mapping lie; ``arrived`` holds signals that are not in the table. Rows
-    where a signal with its own stamps had not arrived, or is older than three of its own steps (0.1 s at least), are
-    left out, which makes a gap; ``engaged`` and ``segment`` are states whose messages mark changes only, so they are
-    held indefinitely. Raises InputError for everything that is certainly wrong.
+    ``arrived`` holds signals that are not in the table. Rows where a signal with its own stamps had not arrived, or is
+    older than three of its own steps (0.1 s at least), are left out, which makes a gap; ``engaged`` and ``segment`` are
+    states whose messages mark changes only, so they are held indefinitely. Raises InputError for everything that is
+    certainly wrong.
     """
     source = table.source
     arrived = arrived or {}
@@ -57,19 +152,17 @@ def assemble(
     spare = _not_needed(table, mapping, arrived)
     for signal in SIGNALS:
         column = mapping.column.get(signal, signal)
-        if signal in mapping.elsewhere:
-            arrivals[signal] = _from_elsewhere(signal, mapping, folder)
-        elif signal in spare:
+        if signal in spare:
             _spare(table, signal, signals, mapping, remarks)
         elif signal in arrived:
             stamps, values = arrived[signal]
             rows = np.arange(len(stamps))
-            arrivals[signal] = _arrivals(table, signal, column, "its clock", values, stamps, rows, None, mapping)
+            arrivals[signal] = _arrivals(table, signal, column, "its clock", values, stamps, rows, mapping)
         elif column in table.names:
             if signal in mapping.stamp:
                 arrivals[signal] = _stamped(table, signal, column, mapping)
             else:
-                signals[signal] = _signal(table, signal, column, mapping, bad, remarks)
+                signals[signal] = _signal(table, signal, column, mapping, bad)
     for signal in mapping.unit:
         if signal not in signals and signal not in arrivals:
             raise InputError(f"{source}: unit {signal}={mapping.unit[signal]}: the log has no column for {signal}")
@@ -113,7 +206,7 @@ def assemble(
     if "segment" in signals:
         fresh |= np.diff(signals["segment"]) != 0
     segment = np.concatenate([[0], np.cumsum(fresh)]).astype(np.int64)
-    used = {mapping.column.get(signal, signal) for signal in SIGNALS if signal not in mapping.elsewhere}
+    used = {mapping.column.get(signal, signal) for signal in SIGNALS}
     used |= set(mapping.stamp.values())
     ignored = tuple(printable(name, 200) for name in table.names if name not in used)
     return Assembled(signals, segment, ignored, tuple(remarks))
@@ -155,11 +248,11 @@ def _converted(signal: str, values: FloatArray, mapping: SignalMap) -> FloatArra
 
 def _require(table: Table, mapping: SignalMap, following: bool) -> None:
     def there(signal: str) -> bool:
-        return mapping.column.get(signal, signal) in table.names or signal in mapping.elsewhere
+        return mapping.column.get(signal, signal) in table.names
 
     for option in (mapping.column, mapping.stamp):
         for signal, column in option.items():
-            if column not in table.names and signal not in mapping.elsewhere:
+            if column not in table.names:
                 there_are = listed(table.names)
                 raise InputError(f"{table.source}: column {quoted(column)} ({signal}) is missing; columns: {there_are}")
     commanded = any(there(signal) for signal in ("accel_cmd", *PEDALS, "speed_cmd"))
@@ -169,27 +262,20 @@ def _require(table: Table, mapping: SignalMap, following: bool) -> None:
         needed = ("time",) if commanded else ("time", "accel_cmd")
     for signal in needed:
         if not there(signal):
-            advice = _advice(signal, table.names)
+            advice = _advice(signal, table)
             if signal == "accel_cmd" and there("spacing") and there("lead_speed"):
                 advice += "; `--follower` diagnoses a car-following log without it"
             elif signal == "accel_cmd":
                 advice += f"; {', '.join(PEDALS)} or speed_cmd can stand for it"
             raise InputError(f"{table.source}: column {signal!r} is missing; {advice}")
     if not there("accel") and not there("speed"):
-        advice = _advice("speed", table.names)
+        advice = _advice("speed", table)
         raise InputError(f"{table.source}: columns 'accel' and 'speed' are both missing; one is needed; {advice}")
-    for signal in mapping.stamp:
-        if signal in mapping.elsewhere:
-            raise InputError(f"{table.source}: {signal} has a stamp column and also a file of its own; one is enough")
 
 
-def _advice(signal: str, names: Iterable[str]) -> str:
-    # a column that is a signal already goes by its own name: a measured `accel` is no command
-    plain = {name.strip().lower(): name for name in names if name not in SIGNALS and len(name) <= _NAME}
-    close = difflib.get_close_matches(signal, plain, n=1, cutoff=0.75)
-    name = plain[close[0]] if close else "NAME"
-    shell = f"--map {signal}={quoted(name) if close else name}"
-    return f"columns: {listed(names)}; `{shell}` or `map={ {signal: name} }` if it goes by another name"
+def _advice(signal: str, table: Table) -> str:
+    option = {signal: "NAME"}
+    return f"columns: {listed(table.names)}; `--map {signal}=NAME` or `map={option}` if it goes by another name"
 
 
 def _place(table: Table, signal: str, column: str, rows: NDArray | None = None) -> Callable[[int], str]:
@@ -197,26 +283,21 @@ def _place(table: Table, signal: str, column: str, rows: NDArray | None = None) 
     return lambda row: table.where(row if rows is None else int(rows[row]), column) + suffix
 
 
-def _signal(table: Table, signal: str, column: str, mapping: SignalMap, bad: BadRows, remarks: list[str]) -> FloatArray:
+def _signal(table: Table, signal: str, column: str, mapping: SignalMap, bad: BadRows) -> FloatArray:
     """A signal (row,) in SI units, NaN in rows that are left out."""
     read = table.readings(column, as_time=signal == "time", as_state=signal == "engaged")
     bad.leave_out(read.faults)
-    remarks += read.remarks
-    values = read.values
-    values = _converted(signal, values, mapping)
-    place = _place(table, signal, column)
-    outside = stray(signal, values, place)
+    values = _converted(signal, read.values, mapping)
+    outside = check_range(signal, values, _place(table, signal, column), spares=True)
     bad.leave_out(outside)
     values[list(outside)] = np.nan
-    known = np.flatnonzero(~np.isnan(values))
-    check_range(signal, values[known], _place(table, signal, column, known))
     return values
 
 
 def _not_needed(table: Table, mapping: SignalMap, arrived: Arrivals) -> set[str]:
     """Commands that are no accelerations, in a log that has one and does not ask for them by its mapping."""
     command = "accel_cmd" in arrived or mapping.column.get("accel_cmd", "accel_cmd") in table.names
-    others = {*PEDALS, "speed_cmd"} - set(mapping.column) - set(mapping.unit) - set(mapping.elsewhere)
+    others = {*PEDALS, "speed_cmd"} - set(mapping.column) - set(mapping.unit)
     return others if command else set()
 
 
@@ -226,7 +307,7 @@ def _spare(table: Table, signal: str, signals: dict[str, FloatArray], mapping: S
         return
     rows = BadRows(table.rows)
     try:
-        values = _signal(table, signal, signal, mapping, rows, [])
+        values = _signal(table, signal, signal, mapping, rows)
     except InputError as fault:
         remarks.append(f"{fault}; {signal} is left out")
         return
@@ -241,12 +322,8 @@ def _leave_out_disordered(table: Table, signals: dict[str, FloatArray], clock: s
     rows = np.flatnonzero(bad.kept)
     time = signals["time"]
     drive = signals.get("segment", np.zeros(len(time)))
-    for faults_of in (off_clock, disordered):
-        rows = rows[bad.kept[rows]]
-        faults = faults_of(time[rows], drive[rows], _place(table, "time", clock, rows))
-        if len(faults) > MOST_BAD * len(time):
-            check_time(time[rows], np.diff(drive[rows]) == 0, _place(table, "time", clock, rows))
-        bad.leave_out({int(rows[row]): words for row, words in faults.items()})
+    faults = time_faults(time[rows], drive[rows], _place(table, "time", clock, rows))
+    bad.leave_out({int(rows[row]): words for row, words in faults.items()})
 
 
 def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tuple[FloatArray, FloatArray]:
@@ -254,7 +331,6 @@ def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tupl
     clock = mapping.stamp[signal]
     values = table.numbers(column, empty_is_nan=True)
     stamps = table.numbers(clock, empty_is_nan=True)
-    unit = mapping.unit.get("time")
     own_clock = clock != mapping.column.get("time", "time")
     half = np.isnan(values) != np.isnan(stamps) if own_clock else np.zeros(len(values), bool)
     if half.any():
@@ -262,38 +338,12 @@ def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tupl
         empty, full = (column, clock) if np.isnan(values[row]) else (clock, column)
         raise InputError(f"{table.where(row, empty)}: is empty where {full!r} is not; both or neither are needed")
     rows = np.flatnonzero(~np.isnan(values))
-    return _arrivals(table, signal, column, clock, values, stamps, rows, unit, mapping)
-
-
-def _from_elsewhere(signal: str, mapping: SignalMap, folder: Path) -> tuple[FloatArray, FloatArray]:
-    """Arrivals of a signal that lies in a file of its own, beside the log."""
-    there = mapping.elsewhere[signal]
-    column = there.column or mapping.column.get(signal, signal)
-    table = read_table(_within(folder, there.file, signal), wanted=lambda names: {column, there.time})
-    for name in (column, there.time):  # messages must not quote other content of a file that only the mapping names
-        if name not in table.names:
-            raise InputError(f"{table.source}: column {quoted(name)} ({signal}) is missing")
-    values, stamps = table.numbers(column), table.numbers(there.time)
-    unit = there.time_unit or mapping.unit.get("time")
-    rows = np.arange(len(values))
-    return _arrivals(table, signal, column, there.time, values, stamps, rows, unit, mapping)
-
-
-def _within(folder: Path, file: str, signal: str) -> Path:
-    """The place of a file that a mapping names. A mapping is not trusted: it may not point outside the log's folder."""
-    try:
-        there = (folder / file).resolve()
-        inside = there.is_relative_to(folder.resolve()) and not Path(file).is_absolute()
-    except (OSError, ValueError, RuntimeError):  # too long, with a zero byte in it, or links in a circle
-        inside, there = False, folder
-    if not inside:
-        raise InputError(f"[signals.{signal}] file: found {quoted(file)}, needs a file in the log's folder or below")
-    return folder / file
+    return _arrivals(table, signal, column, clock, values, stamps, rows, mapping, mapping.unit.get("time"))
 
 
 def _arrivals(
     table: Table, signal: str, column: str, clock: str, values: FloatArray, stamps: FloatArray, rows: NDArray,
-    time_unit: str | None, mapping: SignalMap,
+    mapping: SignalMap, time_unit: str | None = None,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     if len(rows) == 0:
         raise InputError(f"{table.source}: column {column!r} ({signal}): holds no value at all")
@@ -304,5 +354,5 @@ def _arrivals(
     # a recorder that writes the last arrival into every row repeats stamp and value together; that is one arrival
     again = np.concatenate([[False], (np.diff(stamps) == 0) & (np.diff(values) == 0)])
     rows, values, stamps = rows[~again], values[~again], stamps[~again]
-    check_time(stamps, np.ones(len(stamps) - 1, bool), _place(table, f"stamp of {signal}", clock, rows))
+    check_time(stamps, _place(table, f"stamp of {signal}", clock, rows))
     return stamps, values

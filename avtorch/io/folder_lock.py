@@ -13,7 +13,7 @@ from errno import EINVAL, ENOLCK, ENOSYS, EOPNOTSUPP
 from pathlib import Path
 from typing import Any
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, printable
 from avtorch.io.opening import read_regular
 
 LOCK = ".avtorch.lock"
@@ -105,11 +105,10 @@ def _sign(path: Path, work: str) -> None:
 
 
 def _holder(path: Path) -> str:
-    """The process that holds the lock, for a message: short and sanitised, as anyone can write the file."""
+    """The process that holds the lock, for a message."""
     try:
         holder = json.loads(read_regular(path, most=4096, need="a lock", links=False).decode("utf-8"))
-        words = {key: "".join(c for c in str(holder[key])[:80] if c.isprintable()) for key in ("pid", "host", "work")}
-        since = "".join(c for c in str(holder["since"])[:40] if c.isprintable())
+        work, pid, host, since = (printable(str(holder[key]), 80) for key in ("work", "pid", "host", "since"))
     except (ValueError, TypeError, KeyError, RecursionError):
         return "another process"
-    return f"{words['work']} (pid {words['pid']} on {words['host']}, since {since})"
+    return f"{work} (pid {pid} on {host}, since {since})"

@@ -18,15 +18,13 @@ from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError, quoted
 from avtorch.io.answers import atomic
-from avtorch.io.assemble import assemble
+from avtorch.io.assemble import Arrivals, assemble, merged
 from avtorch.io.clock import median_step, since_start, stretches
-from avtorch.io.dataframe import DataFrame, frame_table, is_dataframe
 from avtorch.io.engagement import settled_rows
 from avtorch.io.formats import is_recording, open_recording
 from avtorch.io.mapping import PEDALS, SIGNALS, Pairs, SignalMap, given_mapping, pairs, read_mapping
-from avtorch.io.merge import Arrivals, merged
 from avtorch.io.opening import place
-from avtorch.io.tables import Table, read_table
+from avtorch.io.tables import DataFrame, Table, frame_table, is_dataframe, read_table
 from avtorch.io.units import SI
 from avtorch.io.validity import check_units
 
@@ -122,10 +120,10 @@ class Log(Displayed):
                 )
             columns = {signal: mapping.column.get(signal, signal) for signal in SIGNALS if signal != "time"}
             recorded, arrived = merged(open_recording(path), columns)
-            return cls._of(recorded, mapping, folder=Path(path).parent, following=following, arrived=arrived)
+            return cls._of(recorded, mapping, following=following, arrived=arrived)
         wanted = {mapping.column.get(signal, signal) for signal in SIGNALS} | set(mapping.stamp.values())
         table = read_table(path, wanted=lambda names: wanted)
-        return cls._of(table, mapping, folder=Path(path).parent, following=following)
+        return cls._of(table, mapping, following=following)
 
     @classmethod
     def from_arrays(cls, *, name: str = "arrays", unit: Pairs = None, following: bool = False, **columns: Any) -> Log:
@@ -149,7 +147,7 @@ class Log(Displayed):
         if len(set(lengths.values())) > 1:
             raise InputError(f"{name}: signals differ in length: {', '.join(f'{k} {n}' for k, n in lengths.items())}")
         table = Table(name, tuple(given), tuple(given.values()))
-        return cls._of(table, SignalMap(unit=pairs("unit", unit)), folder=Path(), following=following)
+        return cls._of(table, SignalMap(unit=pairs("unit", unit)), following=following)
 
     @classmethod
     def from_dataframe(
@@ -165,16 +163,14 @@ class Log(Displayed):
     ) -> Log:
         """A log from a data frame of pandas, Polars, pyarrow or DuckDB, checked as a file is; options as in `read`.
 
-        A named index is a column; an index of times without a name is ``time`` (`avtorch.io.dataframe`).
+        A named index is a column; an index of times without a name is ``time`` (`avtorch.io.tables`).
         """
         mapping = given_mapping(SignalMap(), map=map, unit=unit, stamp=stamp, state=state)
-        return cls._of(frame_table(frame, name), mapping, folder=Path(), following=following)
+        return cls._of(frame_table(frame, name), mapping, following=following)
 
     @classmethod
-    def _of(
-        cls, table: Table, mapping: SignalMap, *, folder: Path, following: bool, arrived: Arrivals | None = None
-    ) -> Log:
-        made = assemble(table, mapping, folder=folder, following=following, arrived=arrived)
+    def _of(cls, table: Table, mapping: SignalMap, *, following: bool, arrived: Arrivals | None = None) -> Log:
+        made = assemble(table, mapping, following=following, arrived=arrived)
         signals = made.signals
         time = signals["time"]
         log = cls(

@@ -20,19 +20,9 @@ SIGNALS = (
 PEDALS = ("throttle", "brake", "torque", "current")
 """Commands that are no accelerations; a map makes one of them (`avtorch.pedals`)."""
 
-_TABLES = ("map", "unit", "stamp", "state", "signals")
+_TABLES = ("map", "unit", "stamp", "state")
 _OTHERS = ("fmu",)  # tables of the same file that are not about the log
 Pairs = Mapping[str, Any] | Iterable[str] | None
-
-
-@dataclass(frozen=True)
-class Elsewhere:
-    """A signal that lies in another file: ``column`` there, stamped by ``time`` in ``time_unit``."""
-
-    file: str
-    time: str = "time"
-    column: str | None = None
-    time_unit: str | None = None
 
 
 @dataclass(frozen=True)
@@ -43,7 +33,6 @@ class SignalMap:
     unit: dict[str, str] = field(default_factory=dict)
     stamp: dict[str, str] = field(default_factory=dict)
     state: dict[str, tuple[float, ...]] = field(default_factory=dict)
-    elsewhere: dict[str, Elsewhere] = field(default_factory=dict)
 
 
 def read_mapping(
@@ -53,10 +42,9 @@ def read_mapping(
     arguments, each a dict or a sequence of ``SIGNAL=VALUE``.
 
     The TOML file has the tables ``[map]`` (signal = "column"), ``[unit]`` (signal = "km/h"), ``[stamp]`` (signal = "its
-    own time column"), ``[state]`` (engaged = "1, 3": the numbers that mean yes) and ``[signals.NAME]`` (``file``,
-    ``time``, ``column``, ``time_unit``: a signal in another file, which lies in the log's folder or below). A table
-    ``[fmu]`` is left to `avtorch.external.FmuSimulator`. It is a regular file of up to 1 MB, no link. Raises InputError
-    for another kind of file, and for a signal, unit, table or key that is not known.
+    own time column") and ``[state]`` (engaged = "1, 3": the numbers that mean yes). A table ``[fmu]`` is left to
+    `avtorch.external.FmuSimulator`. It is a regular file of up to 1 MB, no link. Raises InputError for another kind of
+    file, and for a signal, unit or table that is not known.
     """
     beside = mapping_beside(path)
     stated = SignalMap() if beside is None else _read_toml(beside)
@@ -67,13 +55,23 @@ def given_mapping(
     stated: SignalMap, *, map: Pairs = None, unit: Pairs = None, stamp: Pairs = None, state: Pairs = None
 ) -> SignalMap:
     """The mapping that arguments give, on top of what a file `stated`. Raises InputError as `read_mapping` does."""
+    given = _checked(map=map, unit=unit, stamp=stamp, state=state)
     return SignalMap(
-        column=_distinct({**stated.column, **pairs("map", map)}),
-        unit={**stated.unit, **_units(pairs("unit", unit), "")},
-        stamp={**stated.stamp, **_stamps(pairs("stamp", stamp), "")},
-        state={**stated.state, **_states(pairs("state", state), "")},
-        elsewhere=stated.elsewhere,
+        column=_distinct({**stated.column, **given.column}),
+        unit={**stated.unit, **given.unit},
+        stamp={**stated.stamp, **given.stamp},
+        state={**stated.state, **given.state},
     )
+
+
+def _checked(*, map: Pairs, unit: Pairs, stamp: Pairs, state: Pairs) -> SignalMap:
+    units, stamps = pairs("unit", unit), pairs("stamp", stamp)
+    for signal, one in units.items():
+        to_si(signal, one)
+    if "time" in stamps:
+        given = f"stamp time={printable(stamps['time'], 40)}"
+        raise InputError(f"{given}: time is the clock itself; only other signals are stamped")
+    return SignalMap(pairs("map", map), units, stamps, _states(pairs("state", state)))
 
 
 def mapping_beside(log: str | os.PathLike[str]) -> Path | None:
@@ -110,7 +108,9 @@ def pairs(option: str, given: Pairs) -> dict[str, str]:
             items.append((name.strip(), value.strip()))
     answer: dict[str, str] = {}
     for name, value in items:
-        _known(name, f"{option} {printable(name, 40)}={printable(value, 40)}")
+        if name not in SIGNALS:
+            here = f"{option} {printable(name, 40)}={printable(value, 40)}"
+            raise InputError(f"{here}: {quoted(name)} is no signal; signals: {', '.join(SIGNALS)}")
         if answer.get(name, value) != value:
             raise InputError(f"{option} {name}: given as {quoted(answer[name])} and as {quoted(value)}; once is enough")
         answer[name] = value
@@ -120,36 +120,15 @@ def pairs(option: str, given: Pairs) -> dict[str, str]:
 _EXAMPLE = {"map": "accel=CAN.ACC_X", "unit": "speed=km/h", "stamp": "speed=GPS_TIME", "state": "engaged=1,3"}
 
 
-def _known(name: str, where: str) -> None:
-    if name not in SIGNALS:
-        raise InputError(f"{where}: {quoted(name)} is no signal; signals: {', '.join(SIGNALS)}")
-
-
-def _units(units: dict[str, str], where: str) -> dict[str, str]:
-    for signal, unit in units.items():
-        try:
-            to_si(signal, unit)
-        except InputError as fault:
-            raise InputError(f"{where}{fault}") from None
-    return units
-
-
-def _stamps(stamps: dict[str, str], where: str) -> dict[str, str]:
-    if "time" in stamps:
-        given = f"stamp time={printable(stamps['time'], 40)}"
-        raise InputError(f"{where}{given}: time is the clock itself; only other signals are stamped")
-    return stamps
-
-
-def _states(states: dict[str, str], where: str) -> dict[str, tuple[float, ...]]:
+def _states(states: dict[str, str]) -> dict[str, tuple[float, ...]]:
     found: dict[str, tuple[float, ...]] = {}
     for signal, text in states.items():
         if signal != "engaged":
-            raise InputError(f"{where}state {signal}={printable(text, 40)}: only engaged is a state")
+            raise InputError(f"state {signal}={printable(text, 40)}: only engaged is a state")
         try:
             found[signal] = tuple(numeral(part) for part in text.split(","))
         except ValueError:
-            raise InputError(f"{where}state {signal}={printable(text, 40)}: needs numbers such as 1,3") from None
+            raise InputError(f"state {signal}={printable(text, 40)}: needs numbers such as 1,3") from None
     return found
 
 
@@ -174,37 +153,19 @@ def _read_toml(file: Path) -> SignalMap:
         if not isinstance(table, dict):
             raise InputError(f"{here}{name} is no table; write [{name}] and its lines below")
     try:
-        tables = ("map", "unit", "stamp", "state")
-        column, unit, stamp, state = (pairs(name, _texts(content.get(name, {}), name)) for name in tables)
-        elsewhere = {name: _elsewhere(name, table) for name, table in content.get("signals", {}).items()}
+        return _checked(**{name: _texts(content.get(name, {}), name) for name in _TABLES})
     except InputError as fault:
         raise InputError(f"{here}{fault}") from None
-    return SignalMap(column, _units(unit, here), _stamps(stamp, here), _states(state, here), elsewhere)
 
 
 def _texts(table: dict[str, Any], name: str) -> dict[str, str]:
+    texts = {}
     for key, value in table.items():
         if isinstance(value, bool) or not isinstance(value, (str, int, float)):
             # the commonest cause: map.accel = ... with a dot in an unquoted key
             raise InputError(f"[{name}] {printable(key, 40)}: is a {type(value).__name__}; a text is needed")
-    return {key: _text(name, key, value) for key, value in table.items()}
-
-
-def _text(table: str, key: str, value: str | float) -> str:
-    try:
-        return str(value)
-    except ValueError:  # a whole number of thousands of digits
-        raise InputError(f"[{table}] {printable(key, 40)}: is too large a number; a text is needed") from None
-
-
-def _elsewhere(name: str, table: Any) -> Elsewhere:
-    here = f"[signals.{printable(name, 40)}]"
-    _known(name, here)
-    if name == "time" or not isinstance(table, dict) or "file" not in table:
-        raise InputError(f"{here}: needs `file` (and may have `time`, `column`, `time_unit`), for a signal")
-    for key, value in table.items():
-        if key not in ("file", "time", "column", "time_unit") or not isinstance(value, str):
-            raise InputError(f"{here} {printable(key, 40)}: not known, or no text; keys: file, time, column, time_unit")
-    if "time_unit" in table:
-        to_si("time", table["time_unit"])
-    return Elsewhere(**table)
+        try:
+            texts[key] = str(value)
+        except ValueError:  # a whole number of thousands of digits
+            raise InputError(f"[{name}] {printable(key, 40)}: is too large a number; a text is needed") from None
+    return texts

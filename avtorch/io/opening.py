@@ -58,16 +58,14 @@ def opened(path: str | os.PathLike[str], *, need: str, links: bool = True) -> Bi
     shown = place(path)
     # O_NONBLOCK: a pipe would wait for its writer; both flags are missing on Windows, where neither is needed
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-    if not links:
-        if os.path.islink(path):  # on Windows nothing else refuses it
-            raise InputError(f"{shown}: is a symbolic link; {need} is needed")
-        flags |= getattr(os, "O_NOFOLLOW", 0)
+    if not links and os.path.islink(path):
+        raise InputError(f"{shown}: is a symbolic link; {need} is needed")
     try:
         handle = os.open(path, flags)
     except FileNotFoundError:
         raise InputError(f"{shown}: no such file") from None
     except (OSError, ValueError) as fault:
-        raise InputError(f"{shown}: {_why(path, fault, links)}; {need} is needed") from None
+        raise InputError(f"{shown}: {_why(path, fault)}; {need} is needed") from None
     try:
         mode = os.fstat(handle).st_mode
         if not stat.S_ISREG(mode):
@@ -108,10 +106,8 @@ def _read(stream: BinaryIO, most: int) -> bytes:
     return b"".join(pieces)
 
 
-def _why(path: str | os.PathLike[str], fault: Exception, links: bool) -> str:
+def _why(path: str | os.PathLike[str], fault: Exception) -> str:
     if isinstance(fault, OSError):
-        if not links and fault.errno == errno.ELOOP and Path(path).is_symlink():
-            return "is a symbolic link"
         if fault.errno == errno.ENXIO:
             return "is a socket or a device"
         if fault.errno == errno.EISDIR or (fault.errno == errno.EACCES and Path(path).is_dir()):

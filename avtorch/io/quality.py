@@ -14,7 +14,7 @@ from avtorch.io.clock import clock_words, median_step, stretches
 from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import Log
 from avtorch.io.mapping import PEDALS
-from avtorch.io.validity import DELAYS_S, command_scale, line_between, scale_between
+from avtorch.io.validity import DELAYS_S, command_scale, integral, scale_between
 
 LEAST_S = 2.0
 """The shortest stretch [s] of which anything is estimated: the lag and dead time of a car, and as long again."""
@@ -214,12 +214,10 @@ def _doubtful_units(log: Log) -> list[str]:
 
 def _constant(log: Log, parts: list[slice]) -> list[str]:
     """A constant between command and motion that is neither a sensor's offset nor a road."""
-    motion = log.accel
-    if motion is None and log.speed is not None:
-        motion = np.gradient(log.speed, log.elapsed)
-    if motion is None or log.accel_cmd is None:
+    level = log.speed if log.accel is None else integral(log.elapsed, log.accel)
+    if level is None or log.accel_cmd is None:
         return []
-    line = line_between(log.elapsed, parts, motion, log.accel_cmd, delays=DELAYS_S)
+    line = scale_between(log.elapsed, parts, level, log.accel_cmd, delays=DELAYS_S)
     if line is None or line.correlation < 0.8 or abs(line.constant) - 3 * line.sd < _CONSTANT_MPS2:
         return []
     channel = "accel" if log.accel is not None else "speed's derivative"

@@ -1,24 +1,14 @@
 """State files that are accepted only if intact: a checksum, a schema, and the identity of what the content belongs to.
 
-A sealed file is JSON. Its first line holds the schema and the SHA-256 of everything else, so that the checksum is
-compared before anything is parsed:
-
-    {"schema": "avtorch.fits/3", "sha256": "9f…",
-     "of": {…},
-     "content": {…}
-    }
-
-With bytes as content, they follow after the second line. The checksum detects damage and careless edits; it is not a
-signature, and the reader of a file must still check the shape of its content.
+The first line of a sealed file is the SHA-256 of everything else, the second one JSON, the schema and what the content
+belongs to; the content follows. The checksum is compared before anything is parsed. It detects damage and careless
+edits; it is not a signature, and the reader of a file must still check the shape of its content.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import re
-import stat
 import struct
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -29,7 +19,7 @@ import numpy as np
 
 from avtorch.errors import InputError
 from avtorch.io.answers import atomic, json_text
-from avtorch.io.opening import TooLarge, kind_of, read_regular
+from avtorch.io.opening import TooLarge, read_regular
 
 
 def fingerprint(*parts: Any) -> str:
@@ -89,8 +79,6 @@ MOST = 64 * 2**20
 
 REMEDY = "remove it, or use another folder"
 
-_FIRST = re.compile(rb'\{"schema": "([a-z0-9_./-]{1,80})", "sha256": "([0-9a-f]{64})",')
-
 
 class Damaged(InputError):
     """Raised for a regular file whose content is damaged; the caller may compute it again."""
@@ -106,18 +94,13 @@ class Sealed(NamedTuple):
 def write_sealed(path: Path, content: Any, *, schema: str, of: Mapping[str, Any]) -> None:
     """Write `content` (bytes, or what `json_text` accepts) so that `path` is complete or unchanged.
 
-    `of`: what it belongs to. Raises `InputError` where `path` cannot be written, or is a symlink, a folder, a device.
+    `of`: what it belongs to. Raises `InputError` where `path` cannot be written.
     """
-    _free_or_regular(path)
-    if isinstance(content, bytes):
-        line = json_text({"of": of, "bytes": len(content)}, indent=None, ascii_only=True)
-        rest = line[1:].encode() + b"\n" + content
-    else:
-        # a file's name may contain bytes that are not UTF-8
-        rest = json_text({"of": of, "content": content}, ascii_only=True)[1:].lstrip().encode() + b"\n"
-    first = f'{{"schema": "{schema}", "sha256": "{_checksum(schema.encode(), rest)}",\n'
+    # a file's name may contain bytes that are not UTF-8
+    body = content if isinstance(content, bytes) else json_text(content, ascii_only=True).encode()
+    rest = json_text({"schema": schema, "of": of}, indent=None, ascii_only=True).encode() + b"\n" + body
     with atomic(path, binary=True) as stream:
-        stream.write(first.encode() + rest)
+        stream.write(hashlib.sha256(rest).hexdigest().encode() + b"\n" + rest)
 
 
 def read_sealed(path: Path, *, schema: str, most: int = MOST, remedy: str = REMEDY) -> Sealed:
@@ -126,64 +109,38 @@ def read_sealed(path: Path, *, schema: str, most: int = MOST, remedy: str = REME
     `most`: bytes, above which the file is not read. `remedy`: advice to the user, the end of every message. Raises
     `InputError` for what is no regular file, `Damaged` for anything but a file of this `schema` as it was written.
     """
-    found = _parsed(b"{" + _verified(path, schema, most, remedy), path, schema, "content", remedy)
-    return Sealed(found["of"], found["content"])
+    found = read_sealed_bytes(path, schema=schema, most=most, remedy=remedy)
+    return Sealed(found.of, _parsed(found.content, path, remedy))
 
 
 def read_sealed_bytes(path: Path, *, schema: str, most: int = MOST, remedy: str = REMEDY) -> Sealed:
     """The same of a file with bytes as its content."""
-    line, _, content = _verified(path, schema, most, remedy).partition(b"\n")
-    found = _parsed(b"{" + line, path, schema, "bytes", remedy)
-    if found["bytes"] != len(content):
-        _refuse(path, f"holds {len(content)} bytes, not the {str(found['bytes'])[:20]} it names", remedy)
-    return Sealed(found["of"], content)
-
-
-def _verified(path: Path, schema: str, most: int, remedy: str) -> bytes:
-    """What follows the first line, once the checksum is found right."""
     try:
         raw = read_regular(path, most=most, need="a regular file", links=False)
     except TooLarge:
-        _refuse(path, f"is larger than {most / 2**20:.0f} MiB, which no file of its kind is", remedy)
+        raise Damaged(
+            f"{path}: is larger than {most / 2**20:.0f} MiB, which no file of its kind is; {remedy}"
+        ) from None
     except InputError as fault:
         raise InputError(f"{fault}; {remedy}") from None
-    first, newline, rest = raw.partition(b"\n")
-    match = _FIRST.fullmatch(first)
-    if not match or not newline:
-        _refuse(path, "is damaged, or from an earlier avtorch that wrote no checksum", remedy)
-    if _checksum(match[1], rest) != match[2].decode():
-        _refuse(path, "is damaged or was changed by hand: its checksum is not that of its content", remedy)
-    if match[1].decode() != schema:
-        _refuse(path, f"holds {match[1].decode()}, needs {schema}", remedy)
-    return rest
+    first, _, rest = raw.partition(b"\n")
+    if first != hashlib.sha256(rest).hexdigest().encode():
+        raise Damaged(f"{path}: is damaged, changed by hand or of an earlier avtorch: its checksum is wrong; {remedy}")
+    line, _, content = rest.partition(b"\n")
+    head = _parsed(line, path, remedy)
+    if not isinstance(head, dict) or set(head) != {"schema", "of"} or not isinstance(head["of"], dict):
+        raise Damaged(f"{path}: is no {schema} inside; {remedy}")
+    if head["schema"] != schema:
+        raise Damaged(f"{path}: holds {str(head['schema'])[:80]}, needs {schema}; {remedy}")
+    return Sealed(head["of"], content)
 
 
-def _checksum(schema: bytes, rest: bytes) -> str:
-    return hashlib.sha256(schema + b"\n" + rest).hexdigest()
-
-
-def _parsed(text: bytes, path: Path, schema: str, key: str, remedy: str) -> dict[str, Any]:
+def _parsed(text: bytes, path: Path, remedy: str) -> Any:
     try:
-        found = json.loads(text, parse_constant=_no_number)
+        return json.loads(text, parse_constant=_no_number)
     except (ValueError, RecursionError):
-        _refuse(path, "holds no JSON of finite numbers", remedy)
-    if not isinstance(found, dict) or set(found) != {"of", key} or not isinstance(found["of"], dict):
-        _refuse(path, f"is no {schema} inside", remedy)
-    return found
+        raise Damaged(f"{path}: holds no JSON of finite numbers; {remedy}") from None
 
 
 def _no_number(text: str) -> NoReturn:
     raise ValueError(text)
-
-
-def _free_or_regular(path: Path) -> None:
-    try:
-        kind = os.lstat(path).st_mode
-    except (OSError, ValueError):
-        return  # no file yet; the writer reports any other fault
-    if not stat.S_ISREG(kind):
-        raise InputError(f"{path}: is {kind_of(kind)}; a regular file or a free name is needed")
-
-
-def _refuse(path: Path, what: str, remedy: str) -> NoReturn:
-    raise Damaged(f"{path}: {what}; {remedy}")

@@ -1,4 +1,4 @@
-"""CSV and Parquet files as named columns of numbers, with errors that name the row and the column."""
+"""CSV and Parquet files, and data frames, as named columns of numbers, with errors that name the row and the column."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import re
 from array import array
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +18,15 @@ from numpy.typing import NDArray
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats.apart import parquet_apart
+from avtorch.io.formats.kinds import reason
+from avtorch.io.formats.parquet import Cells, readable
 from avtorch.io.formats.parquet import cells_of as arrow_cells
+from avtorch.io.formats.parquet import is_time as is_time_type
 from avtorch.io.opening import MOST_BYTES, MOST_CELLS, MOST_COLUMNS, beginning, place, read_regular
-from avtorch.io.text import Layout, cells_of, decoded, is_time, layout_of, rows_of, seconds_of, unzipped
+from avtorch.io.text import decoded, is_time, layout_of, rows_of, seconds_of, unzipped
 from avtorch.numeral import numeral
 
 _NEED = "a CSV or Parquet file"
-_LINES_AHEAD = 100  # lines searched for a header that other lines precede
 
 Wanted = Callable[[tuple[str, ...]], Collection[str]]
 """Selects the columns to read from the names of a file's columns."""
@@ -35,17 +36,17 @@ Wanted = Callable[[tuple[str, ...]], Collection[str]]
 class Table:
     """Named columns of one file, cells not yet parsed as numbers; None for a column that was not requested.
 
-    Messages name rows as ``row 3 (line 4)``: the third row of data, and the line an editor shows. A Parquet file
-    and arrays have no lines. ``decimal`` is the mark in cells of text; ``units`` are those of a row of units, by
-    column; ``faults``: rows that are no rows, such as one cut off, with what is wrong; ``remarks``: what was guessed;
-    ``form``: the file's format in words.
+    A stamp in two columns, of seconds and of nanoseconds, is one column more (`whole_stamps`). Messages name rows as
+    ``row 3 (line 4)``: the third row of data, and the line an editor shows. A Parquet file and arrays have no lines.
+    ``decimal`` is the mark in cells of text; ``units`` are those of a row of units, by column; ``faults``: rows that
+    are no rows, such as one cut off, with what is wrong; ``remarks``: what was guessed; ``form``: the file's format in
+    words.
     """
 
     source: str
     names: tuple[str, ...]
-    cells: tuple[Sequence[Any] | NDArray | None, ...]
+    cells: tuple[Cells | None, ...]
     lines: Sequence[int] | None = None
-    first: int = 0  # rows of the file before this part of it
     decimal: str = "."
     units: Mapping[str, str] = field(default_factory=dict)
     faults: Mapping[int, str] = field(default_factory=dict)
@@ -54,6 +55,11 @@ class Table:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "source", place(self.source))
+        cells = dict(zip(self.names, self.cells, strict=True))
+        for name, halves in whole_stamps(self.names).items():
+            if name not in cells:
+                object.__setattr__(self, "names", (*self.names, name))
+                object.__setattr__(self, "cells", (*self.cells, _whole(*(cells[half] for half in halves))))
 
     @property
     def rows(self) -> int:
@@ -63,7 +69,7 @@ class Table:
         """The place of a row, or of its cell, in words; ``row`` counts from 0."""
         line = f" (line {self.lines[row]})" if self.lines is not None else ""
         cell = "" if column is None else f", column {quoted(column)}"
-        return f"{self.source}: row {self.first + row + 1}{line}{cell}"
+        return f"{self.source}: row {row + 1}{line}{cell}"
 
     def numbers(self, column: str, *, empty_is_nan: bool = False) -> FloatArray:
         """A column as float64, ``(row,)``.
@@ -93,10 +99,10 @@ class Table:
             raise KeyError(f"column {column!r} was not among the wanted ones")
         faults: dict[int, str] = {row: f"{self.where(row)}: {what}" for row, what in self.faults.items()}
         if isinstance(cells, np.ndarray):
-            values, remarks = np.array(cells, dtype=np.float64), ()
+            values = np.array(cells, dtype=np.float64)
             empty = np.zeros(len(values), dtype=bool)
         elif as_time and (first := next((c for c in cells if _is_text(c)), None)) is not None and is_time(first):
-            values, remarks = seconds_of([cell if isinstance(cell, str) else "" for cell in cells])
+            values = seconds_of([cell if isinstance(cell, str) else "" for cell in cells])
             for row in np.flatnonzero(np.isnan(values)).tolist():
                 if row not in faults:
                     faults[row] = f"{self.where(row, column)}: {quoted(str(cells[row]), 30)} is no time"
@@ -104,14 +110,13 @@ class Table:
         else:
             need = _TIME if as_time else "a number is needed"
             values, empty = self._parse(cells, column, empty_is_nan, as_state, faults, need)
-            remarks = ()
         for row in np.flatnonzero(~np.isfinite(values) & ~empty).tolist():
             if row not in faults:
                 word = "NaN" if math.isnan(values[row]) else "infinite"
                 faults[row] = f"{self.where(row, column)}: is {word}; a finite number is needed"
         values[~np.isfinite(values)] = math.nan
         values[list(faults)] = math.nan
-        return Readings(values, faults, remarks)
+        return Readings(values, faults)
 
     def _parse(
         self,
@@ -148,11 +153,10 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """``values`` (row,), NaN where nothing was read; ``faults``: what is wrong with a cell, by row; ``remarks``."""
+    """``values`` (row,), NaN where nothing was read; ``faults``: what is wrong with a cell, by row."""
 
     values: FloatArray
     faults: Mapping[int, str]
-    remarks: tuple[str, ...] = ()
 
 
 _TIME = "a time is needed: a number, or as 2024-04-23 12:31:47.388 or 12:31:47.388"
@@ -181,25 +185,24 @@ def _no_number(cell: Any, need: str) -> str:
     return f"{quoted(cell, 30)} is no number; a number is needed"
 
 
-def read_table(path: str | os.PathLike[str], *, header: str | None = None, wanted: Wanted | None = None) -> Table:
+def read_table(path: str | os.PathLike[str], *, wanted: Wanted | None = None) -> Table:
     """Read a table of text or a Parquet file, of the columns only those that are `wanted` (default: all).
 
     Text is UTF-8, UTF-16 or Windows-1252, may be gzipped, and has its separator, decimal mark, comments and row of
-    units found (`avtorch.io.text`). ``header`` names the first cell of the header line where other lines come
-    before it that look like one. Unnamed columns get the name ``(unnamed 1)`` by position. Lines end at ``\\n``,
+    units found (`avtorch.io.text`). Unnamed columns get the name ``(unnamed 1)`` by position. Lines end at ``\\n``,
     ``\\r\\n`` or ``\\r`` and nowhere else; empty ones are skipped. A row with too few or too many cells is a fault of
     the table. Raises InputError for any other file: missing, not a regular file, empty, binary, no header, and beyond
     512 MiB, 10,000 columns, 1,000,000 characters in a row, or 20 million cells in the wanted columns.
     """
     file = Path(path)
-    wanted = None if wanted is None else with_halves(wanted)
+    wanted = None if wanted is None else _with_halves(wanted)
     if beginning(file, 4, need=_NEED) == b"PAR1":
         return _parquet(file, wanted)
     raw = read_bytes(file)
     if file.suffix.lower() in (".parquet", ".pq"):
         raise InputError(f"{place(file)}: named as Parquet but its content is not; write it anew, or name it .csv")
     text, remarks = decoded(place(file), raw)
-    return replace(text_table(place(file), text, header, wanted), remarks=remarks)
+    return replace(text_table(place(file), text, wanted), remarks=remarks)
 
 
 def _parquet(file: Path, wanted: Wanted | None) -> Table:
@@ -208,7 +211,7 @@ def _parquet(file: Path, wanted: Wanted | None) -> Table:
         name: arrow_cells(columns.column(name), f"{place(file)}: column {quoted(name)}")
         for name in columns.column_names
     }
-    return Table(place(file), *with_whole_stamps(names, [read.get(name) for name in names]), form="Parquet")
+    return Table(place(file), names, tuple(read.get(name) for name in names), form="Parquet")
 
 
 def read_bytes(file: Path) -> bytes:
@@ -219,11 +222,9 @@ def read_bytes(file: Path) -> bytes:
     return raw
 
 
-def text_table(source: str, text: str, header: str | None, wanted: Wanted | None) -> Table:
+def text_table(source: str, text: str, wanted: Wanted | None) -> Table:
     """A table of text, by its own layout."""
     layout = layout_of(io.StringIO(text, newline=""))
-    if header is not None:
-        layout = replace(layout, header=_line_of(text, layout, header), marked="", units=False)
     rows = rows_of(source, text, layout)
     names = _names(source, next(rows, None))
     chosen = set(names if wanted is None else wanted(names))
@@ -245,16 +246,7 @@ def text_table(source: str, text: str, header: str | None, wanted: Wanted | None
     read = dict(zip(kept, columns, strict=True))
     cells = tuple(read.get(i) for i in range(len(names)))
     form = f"text, {layout.words}"
-    both = with_whole_stamps(names, cells)
-    return Table(source, *both, lines, decimal=layout.decimal, units=units, faults=faults, form=form)
-
-
-def _line_of(text: str, layout: Layout, first_cell: str) -> int:
-    for number, line in enumerate(islice(io.StringIO(text, newline=""), _LINES_AHEAD), 1):
-        cells = cells_of(line, layout.separator)
-        if cells and cells[0].strip() == first_cell:
-            return number
-    return layout.header
+    return Table(source, names, cells, lines, decimal=layout.decimal, units=units, faults=faults, form=form)
 
 
 def _names(source: str, found: tuple[list[str], int] | None) -> tuple[str, ...]:
@@ -297,7 +289,7 @@ def whole_stamps(names: Collection[str]) -> dict[str, tuple[str, str]]:
     return found
 
 
-def with_halves(wanted: Callable[[tuple[str, ...]], Collection[str]]) -> Callable[[tuple[str, ...]], Collection[str]]:
+def _with_halves(wanted: Wanted) -> Wanted:
     """What is wanted of a file's columns, with both columns of a stamp that is."""
 
     def chosen(names: tuple[str, ...]) -> set[str]:
@@ -307,20 +299,11 @@ def with_halves(wanted: Callable[[tuple[str, ...]], Collection[str]]) -> Callabl
     return chosen
 
 
-def with_whole_stamps(
-    names: Sequence[str], cells: Sequence[Sequence[Any] | NDArray | None]
-) -> tuple[tuple[str, ...], tuple[Sequence[Any] | NDArray | None, ...]]:
-    """The `names` and `cells` of a table's columns, with a column of text for each stamp in two: the digits side by
-    side, None where its columns were not read."""
-    whole = list(cells)
-    found = whole_stamps(names)
-    for halves in found.values():
-        seconds, nanoseconds = (cells[names.index(half)] for half in halves)
-        if seconds is None or nanoseconds is None:
-            whole.append(None)
-        else:
-            whole.append([_stamp(str(a).strip(), str(b).strip()) for a, b in zip(seconds, nanoseconds, strict=True)])
-    return (*names, *found), tuple(whole)
+def _whole(seconds: Cells | None, nanoseconds: Cells | None) -> Cells | None:
+    """Texts of both, the digits side by side; None where they were not read."""
+    if seconds is None or nanoseconds is None:
+        return None
+    return [_stamp(str(a).strip(), str(b).strip()) for a, b in zip(seconds, nanoseconds, strict=True)]
 
 
 def _stamp(seconds: str, nanoseconds: str) -> str:
@@ -328,3 +311,39 @@ def _stamp(seconds: str, nanoseconds: str) -> str:
     if whole.isdecimal() and parts.isdecimal() and len(parts) <= 9:
         return f"{whole}.{parts:0>9}"
     return f"{seconds}{_AND}{nanoseconds}"
+
+
+_INDEX = "__index_level_0__"  # pandas' own name for an index without one
+
+
+class DataFrame(Protocol):
+    """A frame with Arrow's PyCapsule interface: pandas from 2.2, Polars from 1.3, pyarrow, DuckDB."""
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object: ...
+
+
+def is_dataframe(given: object) -> bool:
+    """Whether it speaks Arrow's protocol."""
+    return not isinstance(given, type) and hasattr(given, "__arrow_c_stream__")
+
+
+def frame_table(frame: DataFrame, source: str = "DataFrame") -> Table:
+    """The columns of a data frame, cells not yet parsed as numbers; `source` names it in messages.
+
+    An index with a name is a column of that name. An index of times without a name is the column ``time`` where there
+    is none. Times become seconds since their epoch. Columns that hold neither numbers nor texts are not read.
+
+    Raises InputError where the frame cannot be turned into Arrow columns.
+    """
+    import pyarrow as pa
+
+    try:
+        table: Any = pa.table(frame)
+    except (pa.ArrowException, TypeError, ValueError, RuntimeError, NotImplementedError) as fault:
+        raise InputError(f"{source}: no columns of numbers can be read from it ({reason(fault)})") from None
+    names = [str(name) for name in table.column_names]
+    if _INDEX in names and "time" not in names and is_time_type(table.column(names.index(_INDEX)).type):
+        names[names.index(_INDEX)] = "time"
+    kept = [i for i in range(len(names)) if readable(table.column(i).type)]
+    cells = tuple(arrow_cells(table.column(i), f"{source}: column {quoted(names[i])}") for i in kept)
+    return Table(source, tuple(names[i] for i in kept), cells, form=f"a {type(frame).__name__}")

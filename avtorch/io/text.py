@@ -11,15 +11,14 @@ m/s², ° or an umlaut wrongly. So text that is not Unicode is read as Windows-1
 from __future__ import annotations
 
 import csv
+import gzip
 import io
 import re
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from functools import lru_cache
-from zoneinfo import ZoneInfo
+from datetime import datetime
 
 import numpy as np
 
@@ -30,9 +29,8 @@ from avtorch.numeral import numeral
 
 _DAY_S = 86_400.0
 _STAMP = re.compile(
-    r"\s*(?:(?P<a>\d{1,4})(?P<mark>[-/.])(?P<b>\d{1,2})(?P=mark)(?P<c>\d{1,4})[T\s_]+)?"
-    r"(?P<h>\d{1,2}):(?P<m>\d{2}):(?P<s>\d{2})(?:[.,:](?P<fraction>\d{1,12}))?"
-    r"\s*(?P<half>[AaPp][Mm])?\s*(?P<zone>Z|[+-]\d{2}:?\d{2}|[A-Za-z][A-Za-z_]*(?:/[A-Za-z_]+)*)?\s*"
+    r"\s*(?:(?P<day>\d{4}-\d\d-\d\d)[T\s]+)?(?P<clock>\d\d:\d\d:\d\d)(?:[.,](?P<fraction>\d{1,12}))?"
+    r"\s*(?P<zone>Z|UTC|GMT|[+-]\d\d:?\d\d)?\s*"
 )
 _TEXT = 100  # characters of the longest
 
@@ -42,132 +40,60 @@ def is_time(cell: str) -> bool:
     return len(cell) <= _TEXT and _STAMP.fullmatch(cell) is not None
 
 
-def seconds_of(cells: Sequence[str]) -> tuple[FloatArray, tuple[str, ...]]:
-    """Seconds (cell,) of times as text, NaN where a cell is none, and remarks on what was assumed.
+def seconds_of(cells: Sequence[str]) -> FloatArray:
+    """Seconds (cell,) of times as text, NaN where a cell is none.
 
-    With a date they count from 1970, in UTC where a zone is stated (`Z`, an offset, `UTC`, or a name such as
-    `Europe/Berlin`); without one from midnight, and go on counting over the next.
+    With an ISO date they count from 1970, in UTC where an offset is stated; without one from midnight, and go on
+    counting over the next.
     """
-    stamps = [_STAMP.fullmatch(cell) if len(cell) <= _TEXT else None for cell in cells]
-    remarks: list[str] = []
-    order = _order(stamps, remarks)
-    out = np.full(len(cells), np.nan)
-    unknown: set[str] = set()
-    for row, stamp in enumerate(stamps):
+    out, dated = np.full(len(cells), np.nan), False
+    for row, cell in enumerate(cells):
+        stamp = _STAMP.fullmatch(cell) if len(cell) <= _TEXT else None
         if stamp is None:
             continue
-        clock = _clock(stamp)
-        day = 0.0 if stamp["a"] is None else _day(stamp["a"], stamp["b"], stamp["c"], order)
-        if clock is None or day is None:
+        dated |= stamp["day"] is not None
+        try:
+            moment = datetime.fromisoformat(f"{stamp['day'] or '1970-01-01'}T{stamp['clock']}+00:00")
+        except ValueError:  # a time that does not exist
             continue
-        ahead = _ahead(stamp["zone"], day + clock)
-        if ahead is None:
-            unknown.add(stamp["zone"])
-        out[row] = day + clock - (ahead or 0.0)
-    if unknown:
-        remarks.append(f"time zone {', '.join(sorted(unknown)[:3])} is not known and was not applied")
-    if all(stamp is None or stamp["a"] is None for stamp in stamps):
-        _over_midnight(out)
-    return out, tuple(remarks)
+        out[row] = moment.timestamp() + float(f"0.{stamp['fraction'] or 0}") - _offset(stamp["zone"])
+    if not dated:  # a clock of hours begins anew
+        known = np.flatnonzero(np.isfinite(out))
+        out[known[1:]] += _DAY_S * np.cumsum(np.diff(out[known]) < -_DAY_S / 2)
+    return out
 
 
-def _clock(stamp: re.Match[str]) -> float | None:
-    hours, minutes, seconds = int(stamp["h"]), int(stamp["m"]), int(stamp["s"])
-    if stamp["half"]:
-        if not 1 <= hours <= 12:
-            return None
-        hours = hours % 12 + (12 if stamp["half"].lower() == "pm" else 0)
-    if hours > 24 or minutes > 59 or seconds > 60:
-        return None
-    fraction = float(f"0.{stamp['fraction']}") if stamp["fraction"] else 0.0
-    return 3600.0 * hours + 60.0 * minutes + seconds + fraction
-
-
-def _order(stamps: Sequence[re.Match[str] | None], remarks: list[str]) -> str:
-    """`ymd`, `dmy` or `mdy`; a point between the numbers is written day first."""
-    dated = [stamp for stamp in stamps if stamp is not None and stamp["a"] is not None]
-    if not dated or len(dated[0]["a"]) == 4:
-        return "ymd"
-    if any(int(stamp["a"]) > 12 for stamp in dated) or dated[0]["mark"] == ".":
-        return "dmy"
-    if any(int(stamp["b"]) > 12 for stamp in dated) or dated[0]["half"]:
-        return "mdy"
-    remarks.append(f"the date {dated[0]['a']}/{dated[0]['b']}/{dated[0]['c']} is read month first")
-    return "mdy"
-
-
-@lru_cache(maxsize=64)
-def _day(a: str, b: str, c: str, order: str) -> float | None:
-    """Seconds from 1970 to the beginning of a day."""
-    numbers = dict(zip(order, (int(a), int(b), int(c)), strict=True))
-    try:
-        return datetime(numbers["y"], numbers["m"], numbers["d"], tzinfo=UTC).timestamp()
-    except ValueError:
-        return None
-
-
-def _ahead(zone: str | None, stamp: float) -> float | None:
-    """Seconds that a zone's clock is ahead of UTC; None for an unknown one."""
-    if zone is None or zone.upper() in ("Z", "UTC", "GMT"):
+def _offset(zone: str | None) -> float:
+    """Seconds that a zone's clock is ahead of UTC."""
+    if zone is None or zone[0] not in "+-":
         return 0.0
-    if zone[0] in "+-":
-        size = 3600.0 * int(zone[1:3]) + 60.0 * int(zone[-2:])
-        return size if zone[0] == "+" else -size
-    return _ahead_there(zone, int(stamp // 900))
-
-
-@lru_cache(maxsize=256)
-def _ahead_there(zone: str, quarter: int) -> float | None:
-    try:
-        there = ZoneInfo(zone)
-    except (ValueError, OSError, LookupError):
-        return None
-    local = datetime.fromtimestamp(900.0 * quarter, UTC).replace(tzinfo=there)
-    ahead = local.utcoffset()
-    return None if ahead is None else ahead.total_seconds()
-
-
-def _over_midnight(seconds: FloatArray) -> None:
-    """Counts on where a clock of hours begins anew."""
-    known = np.flatnonzero(np.isfinite(seconds))
-    backwards = np.diff(seconds[known]) < -_DAY_S / 2
-    seconds[known[1:]] += _DAY_S * np.cumsum(backwards)
+    size = 3600.0 * int(zone[1:3]) + 60.0 * int(zone[-2:])
+    return size if zone[0] == "+" else -size
 
 
 _BINARY = re.compile(rb"[\x00-\x08\x0b\x0e-\x1a\x1c-\x1f]")
-_PIECE = 2**20
 
 
 def unzipped(source: str, raw: bytes) -> bytes:
     """`raw`, or what it holds if it is gzip. Raises InputError for a damaged one, and beyond `MOST_BYTES`."""
     if not raw.startswith(b"\x1f\x8b"):
         return raw
-    pieces, size, rest = [], 0, raw
     try:
-        while rest.startswith(b"\x1f\x8b"):  # several may follow each other
-            part = zlib.decompressobj(wbits=31)
-            while not part.eof:
-                piece = part.decompress(rest, _PIECE)
-                rest = part.unconsumed_tail
-                pieces.append(piece)
-                size += len(piece)
-                if size > MOST_BYTES:
-                    raise InputError(f"{source}: holds over {MOST_BYTES:,} bytes; {MOST_BYTES:,} at most are needed")
-                if not piece and not rest and not part.eof:
-                    raise InputError(f"{source}: ends inside its gzip data; the whole file is needed")
-            rest = part.unused_data
-    except zlib.error:
+        with gzip.open(io.BytesIO(raw)) as stream:
+            content = stream.read(MOST_BYTES + 1)
+    except EOFError:
+        raise InputError(f"{source}: ends inside its gzip data; the whole file is needed") from None
+    except (OSError, zlib.error):
         raise InputError(f"{source}: damaged gzip data; write the file anew") from None
-    return b"".join(pieces)
+    if len(content) > MOST_BYTES:
+        raise InputError(f"{source}: holds over {MOST_BYTES:,} bytes; {MOST_BYTES:,} at most are needed")
+    return content
 
 
 def decoded(source: str, raw: bytes) -> tuple[str, tuple[str, ...]]:
     """Text, and a remark on its encoding where that had to be guessed. Raises InputError for what is no text."""
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return _utf16(source, raw, "utf-16"), ()
-    silent = _silent_utf16(raw)
-    if silent is not None:
-        return _utf16(source, raw, silent), ()
+        return _utf16(source, raw), ()
     if b"\0" in raw:
         line = _line(raw[: raw.index(b"\0")])
         raise InputError(f"{source}: line {line}: holds a zero byte, so it is binary; {_NEEDED}")
@@ -190,18 +116,9 @@ def decoded(source: str, raw: bytes) -> tuple[str, tuple[str, ...]]:
 _NEEDED = "a CSV or Parquet file is needed"
 
 
-def _silent_utf16(raw: bytes) -> str | None:
-    """The byte order of UTF-16 without a mark: ASCII in it has a zero in every other byte, and nowhere else."""
-    head = raw[:1000]
-    for codec, zero, other in (("utf-16-le", head[1::2], head[::2]), ("utf-16-be", head[::2], head[1::2])):
-        if len(zero) >= 4 and zero.count(0) > 0.7 * len(zero) and 0 not in other:
-            return codec
-    return None
-
-
-def _utf16(source: str, raw: bytes, codec: str) -> str:
+def _utf16(source: str, raw: bytes) -> str:
     try:
-        text = raw.decode(codec)
+        text = raw.decode("utf-16")
     except UnicodeDecodeError as fault:
         raise InputError(f"{source}: byte {fault.start + 1}: is not UTF-16 text; {_NEEDED}") from None
     if "\0" in text:
@@ -365,57 +282,41 @@ _MOST_CHARACTERS = 1_000_000  # of one row
 
 
 def rows_of(source: str, text: str, layout: Layout) -> Iterator[tuple[list[str], int]]:
-    """The header, then all that follows but comments and rows without any cell filled at the end.
+    """The header, then all that follows but comments and rows without any cell filled at the end, each with its line.
 
     Raises InputError for a quotation that does not end, and for a row of over 1,000,000 characters.
     """
-    lines = _Lines(source, text, layout)
-    spaced = layout.separator == " "
-    reader = csv.reader(lines, delimiter=layout.separator, skipinitialspace=spaced, strict=True)
+    spaced, size = layout.separator == " ", 0  # characters of the row that is not complete
+
+    def lines() -> Iterator[str]:
+        nonlocal size
+        for number, line in enumerate(io.StringIO(text, newline=""), 1):
+            if number < layout.header or (number > layout.header and not size and is_comment(line)):
+                yield "\n"
+                continue
+            if number == layout.header and layout.marked:
+                line = line.lstrip()[len(layout.marked) :].lstrip(" ")
+            begins, size = not size, size + len(line)
+            if size > _MOST_CHARACTERS:
+                raise InputError(f"{source}: a row has more than {_MOST_CHARACTERS:,} characters; a CSV file is needed")
+            # trailing spaces would be one more cell
+            yield line.rstrip(" \t\r\n") + "\n" if spaced and begins else line
+
+    reader = csv.reader(lines(), delimiter=layout.separator, skipinitialspace=spaced, strict=True)
     blank: list[tuple[list[str], int]] = []
     while True:
-        lines.open = 0
+        size, first = 0, reader.line_num + 1
         try:
             row = next(reader, None)
         except csv.Error as fault:
-            raise InputError(f"{source}: line {lines.first}: cannot be split into cells ({fault})") from None
+            raise InputError(f"{source}: line {first}: cannot be split into cells ({fault})") from None
         if row is None:
             return
         if not row or (len(row) == 1 and not row[0].strip()):  # nothing but a line's end
             continue
         if not any(cell.strip() for cell in row):  # spreadsheets leave such rows at the end
-            blank.append((row, lines.first))
+            blank.append((row, first))
             continue
         yield from blank
         blank.clear()
-        yield row, lines.first
-
-
-class _Lines:
-    """Lines with their ends, split only at those, from the header on and without comments.
-
-    `open` counts the characters of a row that is not complete, `first` is the number of its first line.
-    """
-
-    def __init__(self, source: str, text: str, layout: Layout) -> None:
-        self.source, self.layout = source, layout
-        self.open = self.first = 0
-        self._lines = io.StringIO(text, newline="")
-
-    def __iter__(self) -> Iterator[str]:
-        for number, line in enumerate(self._lines, 1):
-            if number < self.layout.header:
-                continue
-            if number == self.layout.header:
-                line = line.lstrip()[len(self.layout.marked) :].lstrip(" ") if self.layout.marked else line
-            elif not self.open and is_comment(line):
-                continue
-            if not self.open:
-                self.first = number
-            self.open += len(line)
-            if self.open > _MOST_CHARACTERS:
-                raise InputError(
-                    f"{self.source}: a row has more than {_MOST_CHARACTERS:,} characters; a CSV file is needed"
-                )
-            # trailing spaces would be one more cell
-            yield line.rstrip(" \t\r\n") + "\n" if self.layout.separator == " " and self.open == len(line) else line
+        yield row, first

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError
-from avtorch.io.units import GRAVITY
+from avtorch.io.units import GRAVITY, factor
 
 SPANS_S = (1.0, 4.0)  # the short one suits brisk drives, the long one averages more sensor noise
 MIN_SPANS = 8
@@ -29,12 +29,16 @@ _MAY_BE = 0.5
 
 class Scale(NamedTuple):
     """``slope`` [-]: change of the first signal per integral of the second; ``correlation`` of the two; ``change``:
-    standard deviation of the first one's changes, in its unit per second; ``spans``: how many separate ones."""
+    standard deviation of the first one's changes, in its unit per second; ``spans``: how many separate ones;
+    ``constant``: what the first one changes by beyond the slope, in its unit per second, and its standard error ``sd``.
+    """
 
     slope: float
     correlation: float
     change: float
     spans: float
+    constant: float
+    sd: float
 
     @property
     def factor(self) -> float | None:
@@ -53,51 +57,6 @@ class Scale(NamedTuple):
         return self.slope / r
 
 
-class Line(NamedTuple):
-    """An acceleration over a command: ``slope`` [-] and ``constant`` [m/s^2] with its standard error ``sd``, at their
-    best ``correlation``."""
-
-    slope: float
-    constant: float
-    sd: float
-    correlation: float
-
-
-def line_between(
-    time: NDArray, parts: Sequence[slice], accel: NDArray, command: NDArray, *, delays: Sequence[float]
-) -> Line | None:
-    """Regress means of ``accel`` over the shorter of SPANS_S on those of ``command``, both ``(time,)``, before it by
-    one of ``delays`` [s]; None where there are fewer than MIN_SPANS spans or the command does not move."""
-    span, best = SPANS_S[0], None
-    for delay in delays:
-        means: list[NDArray] = []
-        for part in parts:
-            t = time[part]
-            if len(t) < 3:
-                continue
-            at = np.arange(t[0] + delay, t[-1] - span, span)
-            totals = [
-                np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(t))])
-                for y in (accel[part], command[part])
-            ]
-            ends = (at, at - delay)
-            means.append(
-                np.stack(
-                    [(np.interp(x + span, t, y) - np.interp(x, t, y)) / span for x, y in zip(ends, totals, strict=True)]
-                )
-            )
-        a, u = np.concatenate(means, 1) if means else np.zeros((2, 0))
-        if len(a) < MIN_SPANS or u.std() <= 1e-9 * (1 + np.abs(u).max()) or a.std() == 0:
-            continue
-        r = float(np.corrcoef(u, a)[0, 1])
-        if best is None or r > best.correlation:
-            slope = r * float(a.std() / u.std())
-            left = float(np.sqrt(np.mean((a - a.mean() - slope * (u - u.mean())) ** 2)))
-            sd = left / math.sqrt(len(a)) * math.sqrt(1 + float(u.mean() / u.std()) ** 2)
-            best = Line(slope, float(a.mean() - slope * u.mean()), sd, r)
-    return best
-
-
 def scale_between(
     time: NDArray, parts: Sequence[slice], level: NDArray, rate: NDArray, *, delays: Sequence[float] = (0.0,)
 ) -> Scale | None:
@@ -111,9 +70,14 @@ def scale_between(
     for part in parts:
         t, y = time[part], rate[part]
         if len(t) > 2:
-            totals.append((t, level[part], np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(t))])))
+            totals.append((t, level[part], integral(t, y)))
     found = (_compare(totals, span, delay) for span in SPANS_S for delay in delays)
     return max((x for x in found if x is not None), key=_rank, default=None)
+
+
+def integral(time: NDArray, rate: NDArray) -> FloatArray:
+    """The integral of ``rate`` from the first row on, both ``(time,)``; steps of over a second, gaps, count as one."""
+    return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.clip(np.diff(time), 0.0, 1.0))])
 
 
 def may_be_late(correlation: Any, *, known: Any) -> Any:
@@ -148,13 +112,16 @@ def _compare(totals: list[tuple[NDArray, NDArray, NDArray]], span: float, delay:
             integrals.append(np.interp(starts + span - delay, t, total) - np.interp(starts - delay, t, total))
     if spans < MIN_SPANS:
         return None
-    change, integral = np.concatenate(changes), np.concatenate(integrals)
-    sx, sy = float(change.std()), float(integral.std())
+    change, total = np.concatenate(changes), np.concatenate(integrals)
+    sx, sy = float(change.std()), float(total.std())
     # a constant signal leaves rounding only
-    if sx <= 1e-9 * (1 + np.abs(change).max()) or sy <= 1e-9 * (1 + np.abs(integral).max()):
+    if sx <= 1e-9 * (1 + np.abs(change).max()) or sy <= 1e-9 * (1 + np.abs(total).max()):
         return None
-    correlation = float(np.mean((change - change.mean()) * (integral - integral.mean())) / (sx * sy))
-    return Scale(correlation * sx / sy, correlation, sx / span, spans)
+    r = float(np.mean((change - change.mean()) * (total - total.mean())) / (sx * sy))
+    slope = r * sx / sy
+    left = sx * math.sqrt(max(1 - r**2, 0.0)) / span
+    sd = left / math.sqrt(spans) * math.sqrt(1 + (float(total.mean()) / sy) ** 2)
+    return Scale(slope, r, sx / span, spans, float(change.mean() - slope * total.mean()) / span, sd)
 
 
 def _rank(found: Scale) -> tuple[bool, float]:
@@ -192,17 +159,6 @@ class BadRows:
         if len(words) > _TOLD:
             told.append(f"{len(words) - _TOLD} more rows are left out for a cell that is no valid value")
         return told
-
-
-def beyond(values: FloatArray, low: float, high: float, plausible: float) -> BoolArray:
-    """Values (row,) out of a signal's range that are an exception: few, while all others are plausible.
-
-    A speed of 6553.5 among those of a car is a sensor's code; a top speed of 180 that is never left by much is a unit.
-    """
-    bad = (values < low) | (values > high)
-    rest = np.abs(values[~bad & ~np.isnan(values)])
-    few = 0 < bad.sum() <= MOST_BAD * len(values)
-    return bad if few and len(rest) and rest.max() <= plausible else np.zeros(len(values), bool)
 
 
 def codes(values: FloatArray) -> BoolArray:
@@ -250,9 +206,14 @@ def out_of_order(time: FloatArray) -> BoolArray:
     return out & ~np.isnan(time)
 
 
-def disordered(time: FloatArray, drive: FloatArray, where: Callable[[int], str]) -> dict[int, str]:
-    """Faults of the rows of `time` (row,) [s] that do not rise within their drive."""
-    faults: dict[int, str] = {}
+def time_faults(time: FloatArray, drive: FloatArray, where: Callable[[int], str]) -> dict[int, str]:
+    """What is wrong with rows of `time` (row,) [s]: beyond any clock's count, or not rising within their drive."""
+    faults = {
+        row: f"{where(row)}: found {time[row]:.4g} s, a stamp so far from zero that float64 cannot resolve the rows; "
+        "needs stamps within 1e9 s of the first"
+        for row in np.flatnonzero(np.abs(time) > _BEYOND_CLOCKS).tolist()
+    }
+    time = np.where(np.abs(time) > _BEYOND_CLOCKS, np.nan, time)
     cuts = [0, *(np.flatnonzero(np.diff(drive) != 0) + 1).tolist(), len(time)]
     for first, last in pairwise(cuts):
         part = time[first:last]
@@ -266,6 +227,13 @@ def disordered(time: FloatArray, drive: FloatArray, where: Callable[[int], str])
     return faults
 
 
+def check_time(time: FloatArray, where: Callable[[int], str]) -> None:
+    """Raise InputError at the first row of one drive that `time_faults` has."""
+    faults = time_faults(time, np.zeros(len(time)), where)
+    if faults:
+        raise InputError(faults[min(faults)])
+
+
 def _course(since: float, stamp: float) -> str:
     if stamp == since:
         return f"repeats {stamp:.16g} s"
@@ -275,113 +243,71 @@ def _course(since: float, stamp: float) -> str:
 RATE_HZ = (10.0, 200.0)
 _RATE_SLACK = 0.05  # clocks are off by a little, and 10 Hz is the rate of most recordings
 
-# signal: lowest, highest, unit, explanation of a value outside
-_LIMITS: dict[str, tuple[float, float, str, str]] = {
-    "speed": (-2.0, 150.0, "m/s", "speed is forward speed"),
-    "lead_speed": (-2.0, 150.0, "m/s", "speed is forward speed"),
-    "accel_cmd": (-50.0, 50.0, "m/s2", "no car does that"),
-    "accel": (-50.0, 50.0, "m/s2", "no car does that"),
-    "lead_accel": (-50.0, 50.0, "m/s2", "no car does that"),
-    "jerk": (-5000.0, 5000.0, "m/s3", "no car does that"),
-    "spacing": (0.0, 10000.0, "m", "spacing is bumper to bumper and never negative"),
-    "grade": (-0.5, 0.5, "", "grade is rise over run"),
-    "throttle": (-1.2, 1.2, "", "throttle is a share of the pedal's way"),
-    "brake": (-1e6, 1e8, "", "brake is a share of the pedal's way, or a pressure in Pa"),
-    "torque": (-1e5, 1e5, "Nm", "no car's drive does that"),
-    "current": (-1e4, 1e4, "A", "no car's drive does that"),
-    "speed_cmd": (-20.0, 150.0, "m/s", "speed_cmd is forward speed"),
-}
-# units that would bring a too large value back: unit, its size in SI
-_SUSPECTS: dict[str, tuple[tuple[str, float], ...]] = {
-    "speed": (("km/h", 1 / 3.6), ("cm/s", 0.01), ("mm/s", 0.001)),
-    "lead_speed": (("km/h", 1 / 3.6), ("cm/s", 0.01), ("mm/s", 0.001)),
-    "accel_cmd": (("cm/s2", 0.01), ("mm/s2", 0.001)),
-    "accel": (("cm/s2", 0.01), ("mm/s2", 0.001)),
-    "lead_accel": (("cm/s2", 0.01), ("mm/s2", 0.001)),
-    "spacing": (("cm", 0.01), ("mm", 0.001)),
-    "grade": (("%", 0.01),),
-    "throttle": (("%", 0.01),),
-    "current": (("mA", 0.001),),
-    "speed_cmd": (("km/h", 1 / 3.6), ("cm/s", 0.01), ("mm/s", 0.001)),
-}
-_PLAUSIBLE = {
-    "speed": 70.0,
-    "lead_speed": 70.0,
-    "accel": 12.0,
-    "accel_cmd": 12.0,
-    "lead_accel": 12.0,
-    "spacing": 300.0,
-    "grade": 0.3,
-    "throttle": 1.0,
-    "brake": 3e7,
-    "torque": 1e4,
-    "current": 1000.0,
-    "speed_cmd": 70.0,
+
+class _Limits(NamedTuple):
+    """The range of a signal, the size that all but exceptions have, its unit, why a value outside is wrong, and units
+    that would bring a too large value back."""
+
+    low: float
+    high: float
+    plausible: float
+    unit: str
+    why: str
+    suspects: tuple[str, ...] = ()
+
+
+_SPEED = _Limits(-2.0, 150.0, 70.0, "m/s", "speed is forward speed", ("km/h", "cm/s", "mm/s"))
+_ACCEL = _Limits(-50.0, 50.0, 12.0, "m/s2", "no car does that", ("cm/s2", "mm/s2"))
+_LIMITS: dict[str, _Limits] = {
+    "speed": _SPEED,
+    "lead_speed": _SPEED,
+    "accel_cmd": _ACCEL,
+    "accel": _ACCEL,
+    "lead_accel": _ACCEL,
+    "jerk": _Limits(-5000.0, 5000.0, 5000.0, "m/s3", "no car does that"),
+    "spacing": _Limits(0.0, 10000.0, 300.0, "m", "spacing is bumper to bumper and never negative", ("cm", "mm")),
+    "grade": _Limits(-0.5, 0.5, 0.3, "", "grade is rise over run", ("%",)),
+    "throttle": _Limits(-1.2, 1.2, 1.0, "", "throttle is a share of the pedal's way", ("%",)),
+    "brake": _Limits(-1e6, 1e8, 3e7, "", "brake is a share of the pedal's way, or a pressure in Pa"),
+    "torque": _Limits(-1e5, 1e5, 1e4, "Nm", "no car's drive does that"),
+    "current": _Limits(-1e4, 1e4, 1000.0, "A", "no car's drive does that", ("mA",)),
+    "speed_cmd": _SPEED._replace(low=-20.0, why="speed_cmd is forward speed"),
 }
 
 
-def check_range(signal: str, values: NDArray, where: Callable[[int], str]) -> None:
-    """Raise InputError at the first value that no car produces; ``where`` names the place of a row, counted from 0."""
+def check_range(
+    signal: str, values: FloatArray, where: Callable[[int], str], *, spares: bool = False
+) -> dict[int, str]:
+    """Raise InputError at the first value (row,) that no car produces; ``where`` names the place of a row, from 0.
+
+    Where it `spares` exceptions, their rows and what is wrong with them: few values, while all others are plausible. A
+    speed of 6553.5 among those of a car is a sensor's code; a top speed of 180 that is never left by much is a unit.
+    """
+    plausible = np.inf
     if signal == "engaged":
-        _at_first(~np.isin(values, (0.0, 1.0)), values, where, "0 (driver) or 1 (engaged) is needed")
+        bad, need = ~np.isin(values, (0.0, 1.0)), "0 (driver) or 1 (engaged) is needed"
     elif signal == "segment":
-        _at_first(values != np.round(values), values, where, "a whole number is needed")
+        bad, need, spares = values != np.round(values), "a whole number is needed", False
     elif signal in _LIMITS:
-        low, high, unit, why = _LIMITS[signal]
+        low, high, plausible, unit, why, suspects = _LIMITS[signal]
         bad = (values < low) | (values > high)
-        if bad.any():
-            top = float(np.abs(values).max())
-            suspects = (name for name, size in _SUSPECTS.get(signal, ()) if top * size <= _PLAUSIBLE[signal])
-            guess = next(suspects, None) if top > high else None
-            hint = f"; `--unit {signal}={guess}` if that is its unit" if guess else ""
-            span = f"{low:g} to {high:g} {unit}".strip()
-            _at_first(bad, values, where, f"{span} is needed ({why}{hint})")
-
-
-def stray(signal: str, values: FloatArray, where: Callable[[int], str]) -> dict[int, str]:
-    """What is wrong with values (row,) out of a signal's range, where they are exceptions (`bad_rows.beyond`)."""
-    if signal == "engaged":
-        bad, need = ~np.isin(values, (0.0, 1.0)) & ~np.isnan(values), "0 (driver) or 1 (engaged) is needed"
-    elif signal in _LIMITS and signal in _PLAUSIBLE:
-        low, high, unit, why = _LIMITS[signal]
-        span = f"{low:g} to {high:g} {unit}".strip()
-        bad, need = beyond(values, low, high, _PLAUSIBLE[signal]), f"{span} is needed ({why})"
+        top = float(np.nanmax(np.abs(values), initial=0.0))
+        unit_of = (name for name in suspects if top > high and top * factor(signal, name) <= plausible)
+        guess = next(unit_of, None)
+        hint = f"; `--unit {signal}={guess}` if that is its unit" if guess else ""
+        need = f"{f'{low:g} to {high:g} {unit}'.strip()} is needed ({why}{hint})"
     else:
         return {}
-    if bad.sum() > MOST_BAD * len(values):
-        return {}
-    return {row: f"{where(row)}: is {values[row]:.10g}; {need}" for row in np.flatnonzero(bad).tolist()}
-
-
-def _at_first(bad: NDArray, values: NDArray, where: Callable[[int], str], need: str) -> None:
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise InputError(f"{where(row)}: is {values[row]:.10g}; {need}")
+    rows = np.flatnonzero(bad & ~np.isnan(values))
+    rest = np.abs(np.delete(values, rows))
+    spared = spares and len(rows) <= MOST_BAD * len(values) and np.nanmax(rest, initial=0.0) <= plausible
+    faults = {row: f"{where(row)}: is {values[row]:.10g}; {need}" for row in (rows if spared else rows[:1]).tolist()}
+    if faults and not spared:
+        raise InputError(next(iter(faults.values())))
+    return faults
 
 
 _BEYOND_CLOCKS = 1e24  # nanoseconds since 1970 taken as seconds are 2e18, which `check_rate` reports
-
-
-def check_time(time: NDArray, same_drive: NDArray, where: Callable[[int], str]) -> None:
-    """Raise InputError where time repeats or goes back inside a drive, or where a stamp is beyond any clock's count;
-    ``same_drive`` ``(time - 1,)`` is false where a new value of ``segment`` lets it start anew."""
-    for words in off_clock(time, time, where).values():
-        raise InputError(words)
-    bad = (np.diff(time) <= 0) & same_drive
-    if bad.any():
-        row = int(np.argmax(bad)) + 1
-        what = "repeats" if time[row] == time[row - 1] else f"goes back from {time[row - 1]:.16g} s to"
-        raise InputError(f"{where(row)}: {what} {time[row]:.16g} s; time must rise from row to row")
-
-
-def off_clock(time: FloatArray, drive: FloatArray, where: Callable[[int], str]) -> dict[int, str]:
-    """What is wrong with stamps of `time` (row,) [s] beyond any clock's count, of whichever `drive`."""
-    del drive
-    return {
-        row: f"{where(row)}: found {time[row]:.4g} s, a stamp so far from zero that float64 cannot resolve the rows; "
-        "needs stamps within 1e9 s of the first"
-        for row in np.flatnonzero(np.abs(time) > _BEYOND_CLOCKS).tolist()
-    }
 
 
 def check_rate(step: float, where: str) -> None:
@@ -424,7 +350,7 @@ def command_scale(
     """
     if speed is None:
         assert accel is not None
-        level = np.concatenate([[0.0], np.cumsum(0.5 * (accel[1:] + accel[:-1]) * np.clip(np.diff(time), 0, 1))])
+        level = integral(time, accel)
     else:
         level = speed
     found = scale_between(time, parts, level, u, delays=DELAYS_S)

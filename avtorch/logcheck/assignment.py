@@ -17,13 +17,13 @@ from itertools import product
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.io.assemble import held, merged
 from avtorch.io.formats.listed import Recording
 from avtorch.io.formats.presets import PRESETS, Preset, Source
-from avtorch.io.merge import held, merged
 from avtorch.io.tables import Table, whole_stamps
-from avtorch.io.validity import MIN_SPANS, MOST_BAD, SPANS_S, codes
-from avtorch.logcheck.recorder import lateness
-from avtorch.logcheck.vocabulary import Header, bare_unit, header_of, likeness, means_otherwise, signals_named
+from avtorch.io.validity import DELAYS_S, MIN_SPANS, MOST_BAD, SPANS_S, codes, integral
+from avtorch.logcheck.recorder import lateness, slope_of
+from avtorch.logcheck.vocabulary import NAMED_SIGNALS, Header, bare_unit, header_of, likeness, means_otherwise
 
 _MOST = 5  # columns that are tried for a signal
 _KNOWN = 3.0  # likeness of a column of a known layout
@@ -45,6 +45,11 @@ class Column:
     def name(self) -> str:
         return self.header.name
 
+    @property
+    def by_what(self) -> str:
+        """What tells which signal it is."""
+        return f"by the layout of {self.layout}" if self.layout else "by its name"
+
 
 def columns_of(table: Table) -> list[Column]:
     """The columns of a table that hold numbers or times, but for a twentieth of their cells."""
@@ -57,7 +62,7 @@ def columns_of(table: Table) -> list[Column]:
         layout = {signal: source for signal, (column, source) in known.items() if column == name}
         unit = next((source.unit for source in layout.values() if source.unit), None)
         header = header_of(name, unit or table.units.get(name))
-        alike = {signal: x for signal in signals_named() if (x := likeness(header, signal)) > 0 and signal not in known}
+        alike = {signal: x for signal in NAMED_SIGNALS if (x := likeness(header, signal)) > 0 and signal not in known}
         alike |= dict.fromkeys(layout, _KNOWN)
         alike |= dict.fromkeys(("time",) if name in stamps else (), _STAMP)
         read = table.readings(name, empty_is_nan=True, as_time="time" in alike, as_state=True)
@@ -77,7 +82,7 @@ def table_of(recording: Recording) -> Table:
     named: dict[str, list[str]] = {signal: [channel] for signal, (channel, _) in known.items() if signal != "time"}
     for name in recording.names:
         header = header_of(name, recording.units.get(name))
-        for signal in signals_named():
+        for signal in NAMED_SIGNALS:
             if signal not in known and signal != "time" and likeness(header, signal) > 0:
                 named.setdefault(signal, []).append(name)
     ranked_names = {
@@ -100,10 +105,10 @@ def table_of(recording: Recording) -> Table:
 def layout_of(names: Iterable[str]) -> tuple[Preset | None, dict[str, tuple[str, Source]]]:
     """The known layout of a log with columns `names`: one that has a command and a response; nothing otherwise."""
     there = tuple(names)
-    for preset in PRESETS.values():
+    for preset in PRESETS:
         found = preset.find(there)
         if "accel_cmd" in found and ("speed" in found or "accel" in found):
-            return preset, {signal: one for signal, one in found.items() if signal in signals_named()}
+            return preset, {signal: one for signal, one in found.items() if signal in NAMED_SIGNALS}
     return None, {}
 
 
@@ -138,7 +143,6 @@ _CHANCE = 3.1
 channels, spans and delays."""
 _ALIKE = 0.98  # correlation from which two columns measure one thing
 _TRIED, _KEPT = 60, 3  # columns without a telling name that are compared with the others, and kept of them
-_DELAYS_S = tuple(np.arange(0, 1.01, 0.1).tolist())
 _MOST_STATES = 8  # numbers of a column that is a flag or a state
 _LARGEST = 1e9  # of a speed or an acceleration, in any unit
 _ACCELS = ("m/s2", "g", "mg", "cm/s2", "ft/s2")
@@ -188,7 +192,7 @@ def assign(clock: FloatArray, parts: list[slice], columns: list[Column], given: 
             )
             continue
         found[signal] = column
-        reasons[signal] = _reasons(signal, column, best, options[signal], motion, signal in given)
+        reasons[signal] = _reasons(signal, column, best, motion, signal in given)
     return Assigned(found, reasons, doubts)
 
 
@@ -230,7 +234,7 @@ class _Motion:
         pick = 0 if signal == "speed" else 1
         i, j = self.number[a.name], self.number[b.name]
         found = [abs(float(table[pick][..., i, :].ravel() @ table[pick][..., j, :].ravel())) for table in self.tables]
-        size = len(_DELAYS_S) if pick else 1
+        size = len(DELAYS_S) if pick else 1
         return max(found, default=0.0) / size > _ALIKE
 
     def correlation(self, level: Column, rate: Column) -> float | None:
@@ -239,7 +243,7 @@ class _Motion:
 
     def response(self, channel: str, answer: Column, command: Column) -> float | None:
         """Of the motion that `channel` measures and the integral of `command`, up to 1 s later."""
-        return self._best(0 if channel == "speed" else 1, answer, command, len(_DELAYS_S))
+        return self._best(0 if channel == "speed" else 1, answer, command, len(DELAYS_S))
 
     def _best(self, pick: int, answer: Column, rate: Column, delays: int) -> float | None:
         i, j = self.number[answer.name], self.number[rate.name]
@@ -277,7 +281,7 @@ def _table(
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Changes (column, start), integrals (delay, column, start), each of mean 0 and length 1, and the size of the
     changes as a share of the column's largest value (column,); None where the spans are too few."""
-    last = _DELAYS_S[-1]
+    last = DELAYS_S[-1]
     starts = [np.arange(clock[p][0] + last, clock[p][-1] - span, span / 4) for p in parts if p.stop - p.start > 2]
     if not values or sum(map(len, starts)) < 4 * MIN_SPANS:
         return None
@@ -287,9 +291,9 @@ def _table(
         change, by_delay = [], []
         for part, at in zip(used, starts, strict=True):
             t, y = clock[part], x[part]
-            total = np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(t))])
+            total = integral(t, y)
             change.append(np.interp(at + span, t, y) - np.interp(at, t, y))
-            before = at - np.array(_DELAYS_S)[:, None]
+            before = at - np.array(DELAYS_S)[:, None]
             by_delay.append(np.interp(before + span, t, total) - np.interp(before, t, total))
         both = np.concatenate(change)
         sizes.append(float(both.std()) / max(float(np.abs(x).max()), 1e-300))
@@ -349,9 +353,7 @@ def _comes_first(column: Column, others: Mapping[str, list[Column]], motion: _Mo
     clock = motion.clock
     for name, columns in others.items():
         for other in columns[:1]:
-            y = filled(other)
-            if name == "speed":
-                y = np.interp(clock + 0.25, clock, y) - np.interp(clock - 0.25, clock, y)
+            y = slope_of(clock, filled(other)) if name == "speed" else filled(other)
             late = lateness(clock, motion.parts, filled(column), y)
             if late is not None and late.correlation > 0.5 and late.seconds <= 0:
                 return False
@@ -410,9 +412,7 @@ def _with(signal: str, column: Column, of: Mapping[str, Column | None], motion: 
     return f"correlation {r:.2f} with {next(name for name in names if name != signal)}"
 
 
-def _reasons(
-    signal: str, column: Column, best: Mapping[str, Column | None], options: list[Column], motion: _Motion, given: bool
-) -> list[str]:
+def _reasons(signal: str, column: Column, best: Mapping[str, Column | None], motion: _Motion, given: bool) -> list[str]:
     if given:
         return ["as given"]
     if signal not in column.likeness:
@@ -422,15 +422,7 @@ def _reasons(
             "accel_cmd": "the car's motion follows it",
         }[signal]
         return [f"no name tells; {words} (correlation {abs(motion.strength(signal, column, best)):.2f})"]
-    reasons = [f"by the layout of {column.layout}" if column.layout else "by its name"]
-    others = [
-        c.name
-        for c in options
-        if c is not column
-        and c.likeness.get(signal, 0.0) > 0.9 * column.likeness[signal]
-        and motion.same(signal, column, c)
-    ]
-    return [*reasons, f"as well as {', '.join(others)}"] if others else reasons
+    return [column.by_what]
 
 
 def _one_sided(values: FloatArray) -> bool:

@@ -9,7 +9,6 @@ from typing import Any
 
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
-from avtorch.io.dataframe import DataFrame, frame_table, is_dataframe
 from avtorch.io.formats import is_recording, open_recording
 from avtorch.io.leaders import read_following
 from avtorch.io.log import Log, LogSource, as_log
@@ -17,7 +16,7 @@ from avtorch.io.mapping import Pairs, mapping_beside
 from avtorch.io.opening import place
 from avtorch.io.quality import Quality, require_usable
 from avtorch.io.quality import check as check_quality
-from avtorch.io.tables import read_table
+from avtorch.io.tables import DataFrame, frame_table, is_dataframe, read_table
 from avtorch.logcheck.assignment import table_of
 from avtorch.logcheck.proposal import Proposal, propose
 from avtorch.logcheck.recorder import duration_note, excitation_notes, recorder_notes

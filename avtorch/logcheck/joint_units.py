@@ -15,8 +15,8 @@ from itertools import product
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.io.units import to_si
-from avtorch.io.validity import Scale, late_response, scale_between
+from avtorch.io.units import factor
+from avtorch.io.validity import DELAYS_S, Scale, integral, late_response, scale_between
 
 # natural logarithms of how much rarer a unit is than SI in logs of cars
 _SPEED = {"m/s": 0.0, "km/h": 0.5, "mph": 1.0, "kn": 4.0, "ft/s": 4.0, "cm/s": 4.0, "mm/s": 5.0}
@@ -30,7 +30,6 @@ _MISCALIBRATED, _SHARE = 0.3, 0.1
 _RESPONSE, _GAIN = 0.35, 0.95  # the same of a car's answer to its command, and its middle
 _WORST = 40.0
 _SURE = 0.7  # correlation from which a scale says something
-_DELAYS_S = tuple(np.arange(0, 1.01, 0.1).tolist())
 _SPEED_MPS, _SPEED_SPREAD = 35.0, 8.0  # of the 99th percentile, above which speeds are rare
 _ACCEL_MPS2, _ACCEL_SPREAD = 0.8, 1.2
 _PLAIN = 3.0
@@ -86,11 +85,6 @@ def units_together(
     return UnitTest(best, rival, scales)
 
 
-def factor(signal: str, unit: str) -> float:
-    """Size of a unit in SI."""
-    return float(to_si(signal, unit)(np.ones(1))[0])
-
-
 def _scales(time: FloatArray, signals: Mapping[str, FloatArray], parts: list[slice]) -> dict[tuple[str, str], Scale]:
     """Raw scales between the signals: change of the first per integral of the second."""
     found: dict[tuple[str, str], Scale] = {}
@@ -101,9 +95,8 @@ def _scales(time: FloatArray, signals: Mapping[str, FloatArray], parts: list[sli
         if "speed" in signals:
             _keep(found, ("speed", "accel_cmd"), _response(time, parts, signals["speed"], u))
         if "accel" in signals:
-            a = signals["accel"]
-            total = np.concatenate([[0.0], np.cumsum(0.5 * (a[1:] + a[:-1]) * np.clip(np.diff(time), 0, 1))])
-            _keep(found, ("accel", "accel_cmd"), _response(time, parts, total, u))
+            level = integral(time, signals["accel"])
+            _keep(found, ("accel", "accel_cmd"), _response(time, parts, level, u))
     return found
 
 
@@ -113,7 +106,7 @@ def _keep(found: dict[tuple[str, str], Scale], pair: tuple[str, str], scale: Sca
 
 
 def _response(time: FloatArray, parts: list[slice], level: FloatArray, u: FloatArray) -> Scale | None:
-    found = scale_between(time, parts, level, u, delays=_DELAYS_S)
+    found = scale_between(time, parts, level, u, delays=DELAYS_S)
     if found is not None and found.slope < 0 and late_response(time, parts, level, u)[1]:
         return None  # inverted, or late by half a period: the data cannot tell
     return found

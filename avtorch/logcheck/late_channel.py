@@ -19,6 +19,7 @@ import numpy as np
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.io.clock import stretches
 from avtorch.io.log import Log
+from avtorch.io.validity import integral
 
 DELAY_S = 0.6
 """Delays that are tried, either way [s]."""
@@ -214,10 +215,10 @@ def _part(time: FloatArray, speed: FloatArray, accel: FloatArray, command: Float
     def over(summed: FloatArray) -> FloatArray:
         return (np.interp(at + half, time, summed) - np.interp(at - half, time, summed)) / (2 * half)
 
-    u = over(_integral(time, command))
+    u = over(integral(time, command))
     lags = np.arange(0, round(MEMORY_S / _coarse(step)) + 1, max(round(0.1 / _coarse(step)), 1))
     commands = np.stack([np.concatenate([np.full(k, u[0]), u[: len(u) - k]]) for k in lags], 1)
-    return _Part(over(speed), over(_integral(time, accel)), np.column_stack([commands, np.ones(len(u))]))
+    return _Part(over(speed), over(integral(time, accel)), np.column_stack([commands, np.ones(len(u))]))
 
 
 def _foretold(parts: list[_Part]) -> tuple[list[FloatArray], list[FloatArray]]:
@@ -227,10 +228,6 @@ def _foretold(parts: list[_Part]) -> tuple[list[FloatArray], list[FloatArray]]:
     factors = np.linalg.lstsq(commands, channels, rcond=1e-8)[0]
     both = [part.commands @ factors for part in parts]
     return [x[:, 0] for x in both], [x[:, 1] for x in both]
-
-
-def _integral(time: FloatArray, values: FloatArray) -> FloatArray:
-    return np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(time))])
 
 
 def _coarse(step: float) -> float:

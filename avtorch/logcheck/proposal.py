@@ -13,12 +13,12 @@ from avtorch.errors import printable
 from avtorch.io.clock import gap_limit, stretches
 from avtorch.io.mapping import PEDALS, Pairs, SignalMap, given_mapping
 from avtorch.io.tables import Table
-from avtorch.io.units import stated_unit, to_si
+from avtorch.io.units import factor, stated_unit
 from avtorch.io.validity import MOST_BAD
 from avtorch.logcheck.assignment import MOTION, Column, assign, columns_of, filled, is_state, moves, ranked
-from avtorch.logcheck.joint_units import UnitTest, factor, units_together
+from avtorch.logcheck.joint_units import UnitTest, units_together
 from avtorch.logcheck.recorder import lateness
-from avtorch.logcheck.vocabulary import bare_unit, header_of, is_answer, is_asked, likeness, signals_named
+from avtorch.logcheck.vocabulary import NAMED_SIGNALS, bare_unit, header_of, is_answer, is_asked, likeness
 
 DRIVES = ("throttle", "torque", "current", "speed_cmd")
 """Commands of which one drives the car, those nearest to the actuator first."""
@@ -77,7 +77,7 @@ def unit_of_command(signal: str, column: Column) -> tuple[str | None, str | None
                 "it is a pressure or a torque"
             )
     if signal == "brake" and float(np.quantile(values, 0.99)) <= 0 > float(values.min()):
-        return f"{-float(to_si(signal, unit or '1')(np.ones(1))[0]):.10g}", doubt
+        return f"{-factor(signal, unit or '1'):.10g}", doubt
     return (None if unit in (None, "m/s", "A", "Pa") or (unit == "Nm" and signal == "torque") else unit), doubt
 
 
@@ -179,7 +179,7 @@ def propose(table: Table, *, map: Pairs = None, unit: Pairs = None) -> Proposal:
     doubts += asked
     for signal, column in commands.items():
         unit_of, doubt = unit_of_command(signal, column)
-        reason = [_by_what(column), *([f"in {unit_of}"] if unit_of else [])]
+        reason = [column.by_what, *([f"in {unit_of}"] if unit_of else [])]
         signals[signal] = _proposed(column, unit_of, reason, known)
         doubts += [] if doubt is None or signal in stated.unit else [doubt]
     signals |= _others(left, {**signals, **dict.fromkeys(given)}, signals, found, known)
@@ -196,7 +196,7 @@ def propose(table: Table, *, map: Pairs = None, unit: Pairs = None) -> Proposal:
 def _twice(table: Table) -> list[str]:
     """Names that several columns have, of which none can be told from the other."""
     names = [name for name in dict.fromkeys(table.names) if table.names.count(name) > 1]
-    told = [name for name in names if any(likeness(header_of(name), signal) for signal in signals_named())]
+    told = [name for name in names if any(likeness(header_of(name), signal) for signal in NAMED_SIGNALS)]
     return [f"{table.names.count(name)} columns are called {name}; rename all but the right one" for name in told]
 
 
@@ -251,10 +251,6 @@ def _parts(clock: FloatArray) -> list[slice]:
     broken = np.concatenate([[False], ~((steps > 0) & (steps <= gap_limit(usual)))])
     good: BoolArray = np.isfinite(clock)
     return stretches(good, np.cumsum(broken).astype(np.int64))
-
-
-def _by_what(column: Column) -> str:
-    return f"by the layout of {column.layout}" if column.layout else "by its name"
 
 
 def _swapped(clock: FloatArray, parts: list[slice], found: dict[str, Column], reasons: dict[str, list[str]]) -> None:
@@ -346,7 +342,7 @@ def _others(
             if column.name in used or not (column.when or _can_be(signal, values)):
                 continue
             unit = _unit_besides(signal, column, signals, found)
-            reasons = [_by_what(column)] + ([f"in {unit}"] if unit else [])
+            reasons = [column.by_what] + ([f"in {unit}"] if unit else [])
             out[signal] = replace(_proposed(column, unit, reasons, known), when=column.when)
             used.add(column.name)
             break

@@ -48,7 +48,7 @@ def recorder_notes(log: Log) -> list[str]:
         if values is not None and (step := quantum(values)) is not None:
             notes.append(f"{name} is rounded to {step:.3g} {_UNITS[name]}")
     parts = stretches(log.usable, log.segment)
-    slope = _slope(log)
+    slope = None if log.speed is None else slope_of(log.elapsed, log.speed)
     if (known := late_channel(log)) is not None:
         notes.append(str(known))
     elif slope is not None and log.accel is not None and log.accel_cmd is None:
@@ -109,12 +109,9 @@ def excitation_notes(log: Log) -> list[str]:
     return [*can, *(f"cannot tell {what}" for what in cannot)]
 
 
-def _slope(log: Log) -> FloatArray | None:
-    """The slope of speed over half a second [m/s²]."""
-    if log.speed is None:
-        return None
-    time = log.elapsed
-    return (np.interp(time + 0.25, time, log.speed) - np.interp(time - 0.25, time, log.speed)) / 0.5
+def slope_of(time: FloatArray, speed: FloatArray) -> FloatArray:
+    """The slope of speed (row,) over half a second [m/s²]."""
+    return (np.interp(time + 0.25, time, speed) - np.interp(time - 0.25, time, speed)) / 0.5
 
 
 def _at_rest(log: Log) -> float | None:

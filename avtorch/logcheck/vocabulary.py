@@ -71,6 +71,9 @@ def bare_unit(header: Header, signal: str) -> str | None:
     return last if last is not None and signal in _BARE.get(last, {signal}) else None
 
 
+_TIME = {
+    "time", "timestamp", "t", "stamp", "zeit", "zeitstempel", "secs", "seconds", "elapsed", "clock", "datetime",
+}  # fmt: skip
 _ACCEL = {"accel", "acceleration", "beschl", "beschleunigung", "acc", "ax", "along", "alon", "a", "accx"}
 _SPEED = {"speed", "veloc", "velocity", "geschw", "geschwindigkeit", "vitesse", "v", "vx", "spd", "vel", "vlon"}
 _COMMAND = {
@@ -117,21 +120,7 @@ class _Wanted:
 
 _SIGNALS: dict[str, _Wanted] = {
     "time": _Wanted(
-        (
-            {
-                "time",
-                "timestamp",
-                "t",
-                "stamp",
-                "zeit",
-                "zeitstempel",
-                "secs",
-                "seconds",
-                "elapsed",
-                "clock",
-                "datetime",
-            },
-        ),
+        (_TIME,),
         {"gap", "headway", "collision", "ttc", "lag", "delay", "constant", "gps", "nsec", "nsecs", "nanosec"},
         {"sent", "receive", "header"},
     ),
@@ -169,6 +158,8 @@ _SIGNALS: dict[str, _Wanted] = {
         {"time", "distance", "speed", "length", "driver", "drivetrain", "brake", "override", "mode", "torque", "count"},
     ),
 }
+NAMED_SIGNALS = tuple(_SIGNALS)
+"""Signals that a name may be recognised as."""
 _STEM = 4  # letters from which a word may begin with a wanted one, such as `acceleration` with `accel`
 
 
@@ -184,7 +175,7 @@ def likeness(header: Header, signal: str) -> float:
 
 def _likeness(words: tuple[str, ...], wanted: _Wanted) -> float:
     both = (*words, *(a + b for a, b in pairwise(words)))
-    if not words or any(_holds(both, group) is None for group in wanted.groups):
+    if not words or not all(_holds(both, group) for group in wanted.groups):
         return 0.0
     if any(word in wanted.not_ or _begins(word, wanted.not_) for word in words):
         return 0.0
@@ -208,21 +199,13 @@ def is_asked(header: Header) -> bool:
     return any(word in _COMMAND or _begins(word, _COMMAND) for word in header.words)
 
 
-def signals_named() -> tuple[str, ...]:
-    """Signals that a name may be recognised as."""
-    return tuple(_SIGNALS)
-
-
 def _begins(word: str, group: Collection[str]) -> bool:
     return any(len(stem) >= _STEM and word.startswith(stem) for stem in group)
 
 
-def _holds(words: Collection[str], group: Collection[str]) -> str | None:
-    """The word that is one of the group, or begins or ends with one that is long enough."""
-    for word in words:
-        if word in group:
-            return word
-        for stem in group:
-            if len(stem) >= _STEM and (word.startswith(stem) or word.endswith(stem)):
-                return word
-    return None
+def _holds(words: Collection[str], group: Collection[str]) -> bool:
+    """Whether a word is one of the group, or begins or ends with one that is long enough."""
+    return any(
+        word in group or any(len(stem) >= _STEM and (word.startswith(stem) or word.endswith(stem)) for stem in group)
+        for word in words
+    )

@@ -20,7 +20,6 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.io import atomic
-from avtorch.io.opening import place
 from avtorch.io.tables import Table, read_table
 from avtorch.pedals.pedal_map import ERROR, RATE, PedalMap, PedalTable, unit_of
 
@@ -154,10 +153,6 @@ def write_map(made: PedalMap, folder: str | PathLike[str]) -> list[Path]:
         if table is not None:
             texts[name] = table.text
     out = Path(folder)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as fault:
-        raise InputError(f"{place(out)}: {fault.strerror}; needs a folder that can be written") from None
     for name, text in texts.items():
         with atomic(out / name) as stream:
             stream.write(text)
@@ -168,7 +163,8 @@ def _text(made: PedalMap) -> str:
     words = ", ".join(f"{number} {name}" for name, number in _NUMBER.items())
     words += f", {_LAG} lag [s], {_DELAY} delay [s], {_DRIVEN} speeds driven [m/s], lowest as value, highest as speed"
     lines = [f"# pedal: {words}; value in {_units(made)}; speed [m/s]; accel and sd [m/s2]", ",".join(_HEADER)]
-    tables = {"coasting": PedalTable(np.zeros(1), made.coasting[None], _row(made.coasting_sd)), **made.pedals}
+    sd = None if made.coasting_sd is None else made.coasting_sd[None]
+    tables = {"coasting": PedalTable(np.zeros(1), made.coasting[None], sd), **made.pedals}
     for name, table in tables.items():
         sd = np.zeros_like(table.accel) if table.sd is None else table.sd
         for x, accels, errors in zip(table.pedal.tolist(), table.accel.tolist(), sd.tolist(), strict=True):
@@ -179,10 +175,6 @@ def _text(made: PedalMap) -> str:
     if made.driven is not None:
         lines.append(f"{_DRIVEN},{float(made.driven[0])!r},{float(made.driven[1])!r},0,0")
     return "\n".join(lines) + "\n"
-
-
-def _row(sd: FloatArray | None) -> FloatArray | None:
-    return None if sd is None else sd[None]
 
 
 def _units(made: PedalMap) -> str:

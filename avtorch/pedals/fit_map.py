@@ -10,7 +10,7 @@ the dead time is fitted with them.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,7 @@ from scipy.signal import lfilter
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.engine.priors import FAINT_MAP
+from avtorch.gap.result.budget import HORIZON_S
 from avtorch.gap.result.free_form import (
     GAIN_SD,
     SIZES,
@@ -28,6 +29,7 @@ from avtorch.gap.result.free_form import (
     FreeForm,
     LeftOut,
     Prior,
+    Products,
     Sizes,
     best_form,
     beyond,
@@ -40,10 +42,8 @@ from avtorch.gap.result.output_error import Coefficients, Rows
 from avtorch.gap.simulator.effect import delay_effect
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import LogSource
-from avtorch.pedals.held_out import HeldOut, scored
-from avtorch.pedals.pedal_command import PedalCommand, tabulated
 from avtorch.pedals.pedal_drive import PedalDrive
-from avtorch.pedals.pedal_map import ERROR, RATE, SIGN, PedalMap, PedalTable
+from avtorch.pedals.pedal_map import RATE, SIGN, PedalMap, PedalTable
 
 FACTOR = Sizes(0.0, 0.0)
 """Of the model with one constant a pedal."""
@@ -56,6 +56,7 @@ INDEPENDENT_S = 1.0
 LOOP_BEFORE_S = 10.0
 """How much earlier than what counts the run of a closed loop begins [s]: from a speed that wind has moved it would
 seem to be led back too slowly."""
+_KNOTS = 9  # of commands, beside those of the table
 _LOOP_KNOTS = 10
 _NEAR_ZERO = 0.12  # standard deviations of the error, within which there is one knot
 _KEPT_ROUNDS = 3  # in which it is seen how long what a loop misses lasts
@@ -65,6 +66,37 @@ _FIRST = Sizes(0.3, 0.3)
 _LAG = (float(np.log(0.3)), 1.0)  # mean and standard deviation of ln T_L
 _DEAD_TIMES_S = (0.0, 0.1, 0.2, 0.35, 0.5, 0.8)
 _DEAD_TIME_STEP_S = 0.02  # for its slope, and to which it is found
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Mean squared errors of speed `squares` (block,) [m²/s²] by model: `map`, and `factor`, one constant a pedal.
+    `horizon_s`: the longest of the free runs [s], begun every second of a block.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.pedals import HeldOut
+        >>> better = HeldOut({"map": np.array([0.1, 0.2, 0.1]), "factor": np.array([1.0, 1.3, 1.1])}, 10.0)
+        >>> round(better.rmse("factor"), 2), better.better_than("factor")
+        (1.06, True)
+    """
+
+    squares: Mapping[str, FloatArray]
+    horizon_s: float
+
+    def rmse(self, model: str) -> float:
+        """Root of the mean squared error of speed [m/s]."""
+        return float(np.sqrt(self.squares[model].mean()))
+
+    def gain(self, over: str, *, of: str = "map") -> tuple[float, float]:
+        """By how much the squared error of `of` is below that of `over`, block by block, and its standard error."""
+        less = self.squares[over] - self.squares[of]
+        return float(less.mean()), float(less.std(ddof=1) / np.sqrt(len(less)))
+
+    def better_than(self, over: str) -> bool:
+        """Whether the map's gain is above two of its standard errors."""
+        gain, error = self.gain(over)
+        return gain > 2 * error
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,10 +163,10 @@ def fit_pedals(logs: LogSource | Sequence[LogSource]) -> PedalFit:
     dead_time, first = _with_dead_time(drive, _FIRST, independent, kept)
     _, sizes, fit = best_form(first.car, left, over, independent, _SIZES)
     car = None if drive.is_loop else _plant_of(fit, dead_time)
-    made = _loop_map(drive, fit, dead_time) if car is None else PedalCommand.of_drive(drive).map_of(car)
+    made = _map_of(drive, fit, dead_time)
     rough = Sizes(max(sizes.resistance, _FIRST.resistance), max(sizes.table, _FIRST.table))  # smoothing is no knowledge
     changes = _changes(drive, fit, Prior(fit.car, rough), dead_time, independent)
-    score = scored({"map": (fit, sizes), "factor": (factor, FACTOR)}, left, independent)
+    score = _scored({"map": (fit, sizes), "factor": (factor, FACTOR)}, left, independent)
     lag, late = made.T_L * changes[:, -2], changes[:, -1]
     T_L_sd, dead_time_sd, late_sd = (float(np.sqrt((x**2).sum())) for x in (lag, late, lag + late))
     made = _with_errors(made, drive, fit, changes[:, :-1])
@@ -150,25 +182,36 @@ def _plant_of(fit: Fit, dead_time: float) -> GapPlant:
     return plant([*late, *forms], T_L=T_L, K_L=1.0 + at.gain, sigma=0.0)
 
 
-def _loop_map(drive: PedalDrive, fit: Fit, dead_time: float) -> PedalMap:
-    """The map of a commanded speed: the table over its error, the gain on its slope."""
+def _map_of(drive: PedalDrive, fit: Fit, dead_time: float) -> PedalMap:
+    """The gain, the table over commands and the resistance, by pedals; of a commanded speed by its error and slope.
+
+    More of a pedal never slows the car: where the force turns back, the map is halfway between the least monotone one
+    above it and the greatest below.
+    """
     rows = fit.car.rows
     at = Coefficients.of(fit.x[:-1], rows.shape)
     spans = {name: (float(x.min()), float(x.max())) for name, x in drive.pedals.items()}
-    u = np.unique(np.concatenate([rows.knots_u, [0.0], spans[ERROR]]))
-    made = tabulated(
-        PedalCommand({ERROR: 1.0}, spans, (float(drive.speed.min()), float(drive.speed.max()))),
-        u,
-        rows.knots_v,
-        np.stack([np.interp(u, rows.knots_u, x) for x in at.table.T], 1) + at.curve,
-        float(np.exp(fit.x[-1])),
-        dead_time,
-    )
-    if RATE not in spans:
-        return made
-    knots = np.unique([min(spans[RATE][0], 0.0), 0.0, max(spans[RATE][1], 0.0)])
-    rate = PedalTable(knots, np.outer(max(at.gain, 0.0) * knots, np.ones(len(made.speed))))
-    return replace(made, pedals={**made.pedals, RATE: rate})
+    names = [name for name in spans if name != RATE]
+    ends = [SIGN[name] * drive.factors[name] * x for name in names for x in spans[name]]
+    between = ends if drive.is_loop else np.linspace(min(ends), max(ends), _KNOTS)
+    u = np.unique(np.concatenate([rows.knots_u, between, [0.0]]))
+    force = np.stack([np.interp(u, rows.knots_u, x) for x in at.table.T], 1) + at.curve
+    if not drive.is_loop:
+        force += (1.0 + at.gain) * u[:, None]
+    force = 0.5 * (np.maximum.accumulate(force, 0) + np.minimum.accumulate(force[::-1], 0)[::-1])
+    zero = int(np.searchsorted(u, 0.0))
+    pedals = {}
+    for name in names:
+        order = np.argsort(SIGN[name] * u)
+        low, high = spans[name]
+        pedal = SIGN[name] * u[order] / drive.factors[name]
+        kept = (pedal >= min(low, 0.0) - 1e-9) & (pedal <= high + 1e-9)
+        pedals[name] = PedalTable(pedal[kept], force[order[kept]] - force[zero])
+    if RATE in spans:
+        knots = np.unique([min(spans[RATE][0], 0.0), 0.0, max(spans[RATE][1], 0.0)])
+        pedals[RATE] = PedalTable(knots, np.outer(max(at.gain, 0.0) * knots, np.ones(len(rows.knots_v))))
+    driven = (float(drive.speed.min()), float(drive.speed.max()))
+    return PedalMap(rows.knots_v, force[zero], pedals, float(np.exp(fit.x[-1])), dead_time, driven=driven)
 
 
 def _with_errors(made: PedalMap, drive: PedalDrive, fit: Fit, changes: FloatArray) -> PedalMap:
@@ -281,3 +324,27 @@ def _changes(drive: PedalDrive, fit: Fit, prior: Prior, dead_time: float, indepe
     out = np.zeros((len(root), len(prior.moves) + 1))
     out[:, np.append(prior.moves, True)] = root
     return out
+
+
+def _scored(of: Mapping[str, tuple[Fit, Sizes]], left: LeftOut, independent: float) -> HeldOut:
+    """The score of fits whose blocks are left out in turn: a fifth to a tenth of them, every so-many-th one.
+
+    Lag, dead time and the sizes of the free form are those of the whole drive; forces are fitted without the block.
+    """
+    out, horizon = {}, 0.0
+    for model, (fit, sizes) in of.items():
+        taught = Fit(fit.car, fit.x, cut=True)
+        steps = Products(taught, left).steps(Prior(fit.car, sizes), independent)
+        car = fit.car.with_runs(HORIZON_S)
+        runs = car.runs(float(fit.x[-1]), cut=True)
+        block, own = (np.searchsorted(car.edges, first, side="right") for first in (runs.first, taught.runs.counts))
+        squares = np.full(len(block), np.nan)
+        for is_told, step in zip(left.told[left.way == 0], steps[left.way == 0], strict=True):
+            told = np.isin(block, own[is_told])
+            mean = np.bincount(runs.of_run, drive_runs(car, fit.x + step, cut=True)[0] ** 2, len(told))
+            squares[told] = mean[told] / np.bincount(runs.of_run, minlength=len(told))[told]
+        runs_told = np.isfinite(squares)
+        block, squares = block[runs_told], squares[runs_told]
+        out[model] = np.array([squares[block == k].mean() for k in np.unique(block)])
+        horizon = float((runs.end - runs.first).max()) * car.rows.dt
+    return HeldOut(out, horizon)

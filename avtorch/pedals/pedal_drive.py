@@ -14,6 +14,7 @@ from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.result.output_error import STEP_S
 from avtorch.io import Log, LogSource, as_logs
+from avtorch.io.clock import stretches
 from avtorch.io.mapping import PEDALS
 from avtorch.pedals.pedal_map import ERROR, RATE, SIGN, inputs_of, jumps
 
@@ -53,7 +54,7 @@ class PedalDrive:
         columns: dict[str, list[FloatArray]] = {name: [] for name in (*names, "speed", "starts")}
         for log in each:
             inputs = inputs_of(log, names)
-            for part in _stretches(log):
+            for part in stretches(log.usable, log.segment):
                 time = log.elapsed[part]
                 count = int((time[-1] - time[0]) / dt + 1e-6)
                 if count * dt < _SHORTEST_S:
@@ -139,16 +140,6 @@ def _inputs(logs: Sequence[Log]) -> tuple[str, ...]:
     if not is_loop:
         return moves
     return (ERROR,) if any(jumps(log) for log in logs) else (ERROR, RATE)
-
-
-def _stretches(log: Log) -> list[slice]:
-    """Runs of usable rows without a gap."""
-    out = []
-    for part in log.segments():
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], log.usable[part].astype(int), [0]])))
-        pairs = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
-        out += [slice(part.start + a, part.start + b) for a, b in pairs if b - a > 1]
-    return out
 
 
 def _averaged(edges: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:

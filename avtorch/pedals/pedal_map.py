@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
@@ -43,16 +44,23 @@ def jumps(log: Log) -> bool:
     return bool((np.abs(rate_of(log)[log.usable]) > _JUMP_MPS2).any())
 
 
-def inputs_of(log: Log, names: Iterable[str]) -> dict[str, FloatArray | None]:
-    """What a map takes, by name (row,): pedals of a log, or what its commanded speed asks; None for what it lacks."""
-    out: dict[str, FloatArray | None] = {}
+def inputs_of(log: Log, names: Iterable[str]) -> dict[str, FloatArray]:
+    """What a map takes, by name (row,): pedals of a log, or what its commanded speed asks. Raises `InputError` for what
+    the log lacks."""
+    out: dict[str, FloatArray] = {}
     for name in names:
-        if name not in (ERROR, RATE):
-            out[name] = getattr(log, name)
-        elif log.speed_cmd is None or log.speed is None:
-            out[name] = None
+        own = name if name in PEDALS else "speed_cmd"
+        values = getattr(log, own)
+        if values is None:
+            raise InputError(f"{log.name}: has no {own}, which the map needs")
+        if name == RATE:
+            out[name] = rate_of(log)
+        elif name == ERROR:
+            if log.speed is None:
+                raise InputError(f"{log.name}: has no speed, which the map needs")
+            out[name] = values - np.maximum(log.speed, 0.0)
         else:
-            out[name] = rate_of(log) if name == RATE else log.speed_cmd - np.maximum(log.speed, 0.0)
+            out[name] = values
     return out
 
 
@@ -154,13 +162,8 @@ class PedalMap:
         without one of the pedals.
         """
         if log.speed is None:
-            raise InputError(f"{log.name}: has no speed, which a map of pedals needs")
-        given: dict[str, FloatArray] = {}
-        for name, values in inputs_of(log, self.pedals).items():
-            if values is None:
-                raise InputError(f"{log.name}: has no {name if name in PEDALS else 'speed_cmd'}, which the map needs")
-            given[name] = values
-        return replace(log, accel_cmd=self.accel(np.maximum(log.speed, 0.0), **given))
+            raise InputError(f"{log.name}: has no speed, which the map needs")
+        return replace(log, accel_cmd=self.accel(np.maximum(log.speed, 0.0), **inputs_of(log, self.pedals)))
 
 
 def _check(name: str, knots: FloatArray, values: FloatArray, shape: tuple[int, ...]) -> None:
@@ -172,15 +175,5 @@ def _check(name: str, knots: FloatArray, values: FloatArray, shape: tuple[int, .
 
 
 def _bilinear(x: FloatArray, y: FloatArray, table: FloatArray, at_x: FloatArray, at_y: FloatArray) -> FloatArray:
-    i, a = place(x, at_x)
-    j, b = place(y, at_y)
-    low = (1 - b) * table[i, j] + b * table[i, j + 1]
-    high = (1 - b) * table[i + 1, j] + b * table[i + 1, j + 1]
-    return (1 - a) * low + a * high
-
-
-def place(knots: FloatArray, at: FloatArray) -> tuple[np.ndarray, FloatArray]:
-    """The interval of each value (row,) among rising knots, and how far in it the value is, from 0 to 1."""
-    at = np.clip(at, knots[0], knots[-1])
-    number = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
-    return number, (at - knots[number]) / (knots[number + 1] - knots[number])
+    inside = np.column_stack([np.clip(at_x, x[0], x[-1]), np.clip(at_y, y[0], y[-1])])
+    return RegularGridInterpolator((x, y), table)(inside)

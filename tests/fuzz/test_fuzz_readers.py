@@ -60,8 +60,6 @@ def plain(raw: bytes) -> str:
     """The text as its byte order mark says, else UTF-8, else Windows-1252."""
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return raw.decode("utf-16")
-    if b"\0" in raw[:2]:
-        return raw.decode("utf-16-le" if raw[1] == 0 else "utf-16-be")
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:

@@ -23,7 +23,7 @@ from .test_fuzz_readers import COLUMNS, text
 MAPPINGS = [
     b'[map]\naccel = "a b"\n[unit]\nspeed = "km/h"\naccel = "g"\n',
     b'[unit]\nspeed = 0.5\naccel = "-1"\n[stamp]\nspeed = "own"\n',
-    b'map = {accel = "ACC"}\n[signals.grade]\nfile = "grade.csv"\ntime = "time"\ncolumn = "g"\ntime_unit = "s"\n',
+    b'map = {accel = "ACC"}\n[state]\nengaged = "1, 3"\n',
     b"# nothing\n",
 ]
 UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 1609.344 / 3600, "g": 9.80665}
@@ -35,7 +35,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     accel = COLUMNS["accel"]
     more = {"a b": accel, "ACC": accel, "own": COLUMNS["time"]}
     (made / "lap.csv").write_bytes(text(COLUMNS | more))
-    (made / "grade.csv").write_bytes(text({"time": COLUMNS["time"], "g": [0.01] * len(accel)}))
     return made
 
 

@@ -195,8 +195,6 @@ def test_symlinks_folders_and_fifos_are_refused(saved: BeliefStream, tmp_path: P
     os.mkfifo(fifo)
     for place, told in ((link, "a symbolic link"), (folder, "a directory"), (fifo, "a named pipe")):
         with pytest.raises(InputError, match=f"{place.name}: is {told}"):
-            saved.save(place)
-        with pytest.raises(InputError, match=f"{place.name}: is {told}"):
             new().load(place)
     assert path.read_bytes() == before
     assert link.is_symlink()
@@ -210,7 +208,7 @@ def test_a_state_of_an_earlier_avtorch_is_refused(saved: BeliefStream, tmp_path:
     """Without a checksum it is not known whether it is as it was saved."""
     path = tmp_path / "state"
     torch.save({key: value for key, value in saved.state_dict().items() if key != "sha256"}, path)
-    with pytest.raises(InputError, match="from an earlier avtorch"):
+    with pytest.raises(InputError, match="of an earlier avtorch"):
         new().load(path)
 
 

@@ -128,21 +128,6 @@ def with_mapping(tmp_path: Path, text: str) -> Path:
 SECRET = "root:x:0:0:root:/root"
 
 
-def test_a_mapping_shows_nothing_of_a_file_it_points_at(tmp_path: Path) -> None:
-    (tmp_path / "secret").write_text(f"{SECRET}\n0,1\n1,2\n", encoding="utf-8")
-    data = tmp_path / "data"
-    data.mkdir()
-    for target in ("/etc/passwd", "../secret", str(tmp_path / "secret"), "in/../../secret"):
-        log = with_mapping(data, f'[signals.speed]\nfile = "{target}"\n')
-        assert "root:x" not in refused(lambda log=log: Log.read(log), "needs a file in the log's folder")
-    (data / "link").symlink_to(tmp_path / "secret")
-    log = with_mapping(data, '[signals.speed]\nfile = "link"\n')
-    assert "root:x" not in refused(lambda: Log.read(log), "needs a file in the log's folder")
-    (data / "inner.csv").write_text(f"{SECRET}\n0\n1\n", encoding="utf-8")
-    log = with_mapping(data, '[signals.speed]\nfile = "inner.csv"\n')
-    assert "root:x" not in refused(lambda: Log.read(log), "column 'speed' (speed) is missing")
-
-
 def test_a_mapping_is_no_link(tmp_path: Path) -> None:
     (tmp_path / "secret").write_text(f"{SECRET}\n", encoding="utf-8")
     write(tmp_path / "lap.csv", GOOD)

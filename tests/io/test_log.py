@@ -199,11 +199,6 @@ def test_signals_with_their_own_stamps_are_held(tmp_path):
     np.testing.assert_array_equal(log.speed, expected[1:])
     assert log.ignored == ()
     assert any("1 rows left out where speed had not arrived" in note for note in check(log).notes)
-    # the same signal in a file of its own
-    write(tmp_path / "own.csv", own)
-    write(tmp_path / "gps.csv", {"t": stamps * 1e3, "v": GOOD["speed"][slow]})
-    (tmp_path / "own.toml").write_text('[signals.speed]\nfile="gps.csv"\ntime="t"\ncolumn="v"\ntime_unit="ms"\n')
-    np.testing.assert_allclose(Log.read(tmp_path / "own.csv").speed, log.speed, rtol=1e-12)
     # and written only in the rows where it arrived
     sparse = [repr(float(x)) if i % 5 == 0 else "" for i, x in enumerate(GOOD["speed"])]
     log = Log.read(write(tmp_path / "sparse.csv", own | {"speed": sparse}), stamp=["speed=time"])

@@ -30,8 +30,8 @@ def test_content_comes_back_to_the_bit(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "state.json"
     write_sealed(path, CONTENT, schema=SCHEMA, of=OF)
     assert read_sealed(path, schema=SCHEMA) == (OF, CONTENT)
-    # anyone can read it as JSON
-    assert json.loads(path.read_text(encoding="utf-8"))["content"] == CONTENT
+    # anyone can read it: JSON from the second line on
+    assert json.loads(path.read_text(encoding="utf-8").split("\n", 2)[2]) == CONTENT
     write_sealed(path, b"{\n\x00\xff", schema=SCHEMA, of=OF)
     assert read_sealed_bytes(path, schema=SCHEMA) == (OF, b"{\n\x00\xff")
 
@@ -52,16 +52,12 @@ def test_every_byte_counts(tmp_path: Path, binary: bool) -> None:
                 read(path, schema=SCHEMA)
 
 
-def forged(body: bytes, schema: str = SCHEMA) -> bytes:
+def forged(body: bytes) -> bytes:
     """A file with a right checksum over a `body` that the writer would not write."""
-    return (
-        b'{"schema": "%s", "sha256": "%s",\n'
-        % (
-            schema.encode(),
-            hashlib.sha256(schema.encode() + b"\n" + body).hexdigest().encode(),
-        )
-        + body
-    )
+    return hashlib.sha256(body).hexdigest().encode() + b"\n" + body
+
+
+HEAD = b'{"schema": "avtorch.test/1", "of": {}}\n'
 
 
 @pytest.mark.parametrize(
@@ -69,25 +65,26 @@ def forged(body: bytes, schema: str = SCHEMA) -> bytes:
     [
         b"",
         b"}",
-        b'"of": {}}',
-        b'"of": {}, "content": 1, "more": 2}',
-        b'"of": [], "content": 1}',
-        b'"of": {}, "content": NaN}',
-        b'"of": {}, "content": -Infinity}',
-        b'"of": {}, "content": ' + b"9" * 100_000 + b"}",
-        b'"of": {}, "content": ' + b"[" * 100_000 + b"]" * 100_000 + b"}",
-        b'"of": {}, "content": "\xff"}',
-        b'"of": {}, "content": 1} and more',
+        HEAD,
+        b'{"schema": "avtorch.test/1", "of": {}, "more": 2}\n1',
+        b'{"schema": "avtorch.test/1", "of": []}\n1',
+        HEAD + b"NaN",
+        HEAD + b"-Infinity",
+        HEAD + b"9" * 100_000,
+        HEAD + b"[" * 100_000 + b"]" * 100_000,
+        HEAD + b'"\xff"',
+        HEAD + b"1 and more",
     ],
-    ids=lambda body: body[:40].decode("latin-1"),
+    ids=lambda body: body[-40:].decode("latin-1"),
 )
 def test_a_right_checksum_over_nonsense_helps_nothing(tmp_path: Path, body: bytes) -> None:
     path = tmp_path / "state"
     path.write_bytes(forged(body))
     with pytest.raises(Damaged):
         read_sealed(path, schema=SCHEMA)
-    with pytest.raises(Damaged):
-        read_sealed_bytes(path, schema=SCHEMA)
+    if not body.startswith(HEAD):
+        with pytest.raises(Damaged):
+            read_sealed_bytes(path, schema=SCHEMA)
 
 
 def test_another_schema_and_too_much_are_refused(tmp_path: Path) -> None:
@@ -98,11 +95,11 @@ def test_another_schema_and_too_much_are_refused(tmp_path: Path) -> None:
     with pytest.raises(Damaged, match="is larger than"):
         read_sealed(path, schema="avtorch.other/1", most=100)
     path.write_text(json.dumps({"fits": []}))
-    with pytest.raises(Damaged, match="from an earlier avtorch that wrote no checksum; do this"):
+    with pytest.raises(Damaged, match="changed by hand or of an earlier avtorch: its checksum is wrong; do this"):
         read_sealed(path, schema=SCHEMA, remedy="do this")
 
 
-def test_only_regular_files_are_read_or_replaced(tmp_path: Path) -> None:
+def test_only_regular_files_are_read(tmp_path: Path) -> None:
     """A FIFO would keep its reader waiting, a device would never end, a symlink leads elsewhere."""
     real = tmp_path / "real"
     write_sealed(real, CONTENT, schema=SCHEMA, of={})
@@ -120,8 +117,6 @@ def test_only_regular_files_are_read_or_replaced(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=f"{path.name}: is {kind}") as caught:
             read_sealed(path, schema=SCHEMA)
         assert not isinstance(caught.value, Damaged)
-        with pytest.raises(InputError, match=f"{path.name}: is {kind}"):
-            write_sealed(path, CONTENT, schema=SCHEMA, of={})
     assert real.read_bytes() == before
     with pytest.raises(InputError, match="missing: no such file; remove it"):
         read_sealed(tmp_path / "missing", schema=SCHEMA)

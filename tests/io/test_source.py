@@ -12,7 +12,7 @@ import pytest
 from avtorch import GLVDPlant, Leader, Log, check, compare, diagnose, estimate, simulate
 from avtorch.errors import InputError
 from avtorch.io import as_log, as_logs
-from avtorch.io.dataframe import frame_table
+from avtorch.io.tables import frame_table
 
 
 @pytest.fixture(scope="module")
@@ -23,16 +23,6 @@ def log() -> Log:
 def columns(log: Log) -> dict[str, np.ndarray]:
     names = ("time", "accel_cmd", "accel", "speed")
     return {name: values for name in names if (values := getattr(log, name)) is not None}
-
-
-class OnlyInterchange:
-    """A frame of a library that knows the older protocol alone."""
-
-    def __init__(self, table: pa.Table) -> None:
-        self._table = table
-
-    def __dataframe__(self, nan_as_null: bool = False, allow_copy: bool = True) -> Any:
-        return self._table.__dataframe__(nan_as_null, allow_copy)
 
 
 class OnlyArrow:
@@ -57,7 +47,6 @@ FRAMES = {
     "pandas": pandas_frame,
     "polars": polars_frame,
     "arrow": pa.table,
-    "interchange": lambda given: OnlyInterchange(pa.table(given)),
     "capsule": lambda given: OnlyArrow(pa.table(given)),
 }
 

@@ -7,23 +7,21 @@ opened. ``avtorch[logs]`` brings all of them.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 
 from avtorch.errors import InputError
 from avtorch.io.formats.apart import open_apart
-from avtorch.io.formats.kinds import NEED, is_kind, kind_at, refuse_missing
+from avtorch.io.formats.kinds import NEED, is_recording, kind_at, refuse_missing
 from avtorch.io.formats.listed import Recording
 from avtorch.io.opening import place
 
 __all__ = ["is_recording", "open_recording"]
 
 
-def open_recording(path: str | os.PathLike[str], *, dbc: Sequence[str | os.PathLike[str]] | None = None) -> Recording:
+def open_recording(path: str | os.PathLike[str]) -> Recording:
     """Open a recording; its format is recognised by how it begins, then by its suffix.
 
-    `dbc` names the databases that decode a CAN log; by default the ``.dbc`` beside the log that has its name, or the
-    only one in its folder. Other formats take none. Names are listed and no samples are read, except where a format
-    has to be read to be listed (MAT before 7.3, Excel).
+    A CAN log is decoded by the ``.dbc`` of its name beside it, or the only one in its folder. Names are listed and no
+    samples are read, except where a format has to be read to be listed (MAT before 7.3, Excel).
 
     Each is read in a process of its own, which a damaged file may end or fill; it lives as long as the recording.
 
@@ -34,17 +32,5 @@ def open_recording(path: str | os.PathLike[str], *, dbc: Sequence[str | os.PathL
     if kind is None:
         what = "a directory without the metadata.yaml of a ROS 2 bag" if os.path.isdir(path) else "no recording"
         raise InputError(f"{place(path)}: is {what}; {NEED} is needed")
-    if dbc is not None and kind.reader != "can":
-        raise InputError(f"{place(path)}: is {kind.words}, which no DBC decodes; dbc is for CAN logs")
-    if isinstance(dbc, (str, os.PathLike)):
-        raise InputError(f"dbc: found {place(dbc)}; a list of paths is needed")
     refuse_missing(place(path), kind)
-    return open_apart(path, kind, dbc)
-
-
-def is_recording(path: str | os.PathLike[str]) -> bool:
-    """Whether `open_recording` is the one to read `path`: by its first bytes, or by its suffix where they are damaged.
-
-    False for CSV, Parquet, and where there is no such file. Reads at most 4096 bytes and loads no library.
-    """
-    return is_kind(path)
+    return open_apart(path, kind)

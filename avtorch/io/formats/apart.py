@@ -24,17 +24,16 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.io.formats.kinds import PARQUET, Kind
-from avtorch.io.formats.listed import Channel, Listed
+from avtorch.io.formats.listed import Channel, Recording
 from avtorch.io.opening import place
 
 MOST_SECONDS, SECONDS_PER_MIB = 60.0, 1.0
 """For opening, and for each reading, by the size of the file: a workbook of 20 million cells takes a third of that."""
 
 
-def open_apart(path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None = None) -> Listed:
-    """Open a recording in a process of its own; `dbc`: the databases of a CAN log. Raises InputError, also where that
-    process ends or takes too long."""
-    child = Child(path, kind, dbc)
+def open_apart(path: str | os.PathLike[str], kind: Kind) -> Recording:
+    """Open a recording in a process of its own. Raises InputError, also where that process ends or takes too long."""
+    child = Child(path, kind)
 
     def load(names: tuple[str, ...]) -> dict[str, Channel]:
         answer = child.ask(names)
@@ -42,7 +41,7 @@ def open_apart(path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.
         return {name: Channel(name, clocks[k], child.numbers(len(clocks[k]))) for name, k in answer["channels"]}
 
     listing = child.listing
-    found = Listed(child.source, listing["form"], listing["names"], listing["units"], listing["remarks"], load)
+    found = Recording(child.source, listing["form"], listing["names"], listing["units"], listing["remarks"], load)
     weakref.finalize(found, child.end)
     return found
 
@@ -56,7 +55,7 @@ def parquet_apart(
     """
     import pyarrow as pa
 
-    child = Child(path, PARQUET, None)
+    child = Child(path, PARQUET)
     try:
         names = tuple(child.listing["names"])
         answer = child.ask(tuple(names if wanted is None else wanted(names)))
@@ -69,7 +68,7 @@ class Child:
     """The other process: requests are lines of JSON, answers are a line of JSON and the numbers it tells of. `listing`
     is its first answer."""
 
-    def __init__(self, path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None) -> None:
+    def __init__(self, path: str | os.PathLike[str], kind: Kind) -> None:
         self.source, self._words = place(path), kind.words
         self._seconds = MOST_SECONDS + SECONDS_PER_MIB * _size(path) / 2**20
         self._late = False
@@ -78,10 +77,9 @@ class Child:
         # a trace of a panic, which nobody sees, takes most of a second
         environment = dict(os.environ, RUST_BACKTRACE="0")
         environment["PYTHONPATH"] = os.pathsep.join(part for part in sys.path if part)
-        databases = [] if dbc is None else ["--dbc", *(os.fspath(base) for base in dbc)]
         try:
             self._process = subprocess.Popen(
-                [*command, kind.words, os.fspath(path), *databases],
+                [*command, kind.words, os.fspath(path)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,

@@ -1,8 +1,7 @@
 """The process in which a reader runs apart: opens one recording, then answers requests for its channels.
 
-Arguments are the name of the format, the path, and the databases of a CAN log. Each request is a line of JSON, the
-names; each answer is a line of JSON, then the numbers: the clocks, then the values of the channels, or the columns of a
-Parquet file as an Arrow stream.
+Arguments are the name of the format and the path. Each request is a line of JSON, the names; each answer is a line of
+JSON, then the numbers: the clocks, then the values of the channels; of a Parquet file its columns as an Arrow stream.
 """
 
 from __future__ import annotations
@@ -29,8 +28,7 @@ def main() -> None:
     kind = kinds.named(sys.argv[1])
     try:
         reader = importlib.import_module(f"avtorch.io.formats.{kind.reader}")
-        given = {"dbc": sys.argv[4:]} if sys.argv[3:4] == ["--dbc"] else {}
-        opened: Any = reader.open_file(sys.argv[2], kind, **given)
+        opened: Any = reader.open_file(sys.argv[2], kind)
     except InputError as fault:
         answer(out, {"error": str(fault)})
         return

@@ -9,7 +9,7 @@ from typing import Any
 
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.formats.kinds import Kind, guarded, library
-from avtorch.io.formats.listed import Listed, Piece, topic_recording
+from avtorch.io.formats.listed import Piece, Recording, topic_recording
 from avtorch.io.opening import place
 
 _NEED = "an undamaged Apollo record, closed by its recorder or by `cyber_recorder recover`,"
@@ -19,7 +19,7 @@ _MOST = 2000  # fields of one type: types within types may multiply
 Path = tuple[str, ...]
 
 
-def open_file(path: str | os.PathLike[str], kind: Kind) -> Listed:
+def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
     """Open a record and list the numbers of its topics by the definitions it holds, without reading a message.
 
     Channels are ``/topic/field/sub``, every number that is not repeated, NaN where a message has not set it; their time

@@ -5,15 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.formats import kinds
-from avtorch.io.formats.bag_types import LAYOUTS
 from avtorch.io.formats.kinds import Kind, guarded, library
-from avtorch.io.formats.listed import Listed, Piece, topic_recording
+from avtorch.io.formats.listed import Piece, Recording, topic_recording
 from avtorch.io.opening import place
 
 _NEED = "an undamaged ROS bag with its index (`rosbag reindex` or `mcap recover` mends one that was cut off)"
@@ -41,7 +41,7 @@ class _Topic:
     fields: tuple[str, ...]
 
 
-def open_file(path: str | os.PathLike[str], kind: Kind) -> Listed:
+def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
     """Open a bag and list its fields from the definitions of its types, without reading a message.
 
     Channels are ``/topic/field/sub``, every numeric field but arrays; their time is the stamp of the message's header
@@ -52,7 +52,7 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Listed:
     typesys = library("rosbags.typesys", source, kind)
     with guarded(source, _NEED):
         reader = _opened(Path(path), kind, source)
-        topics, left = _topics(reader.connections, _Known(typesys))
+        topics, left = _topics(reader.connections, typesys)
     fields: dict[str, tuple[str, str]] = {}
     for name, topic in topics.items():
         for field in topic.fields:
@@ -122,52 +122,45 @@ def _taker(topic: _Topic, paths: Sequence[str], piece: Piece) -> Callable[[Any, 
     return take
 
 
-class _Known:
-    """Stores of types: one for each definition in the bag, and those for types that it does not define."""
+def _stores_of(typesys: Any) -> Callable[[str, Any], tuple[Any, ...]]:
+    """By a type and its definition the stores that know it: one for each definition in the bag, and those for types
+    that it does not define."""
 
-    def __init__(self, typesys: Any) -> None:
-        self._typesys = typesys
-        self._own: dict[tuple[str, Any], tuple[Any, ...]] = {}
-        self._others: tuple[Any, ...] = ()
+    @cache
+    def stores(type_: str, definition: Any) -> tuple[Any, ...]:
+        return (defined(type_, definition),) if definition.data else undefined()
 
-    def stores(self, connection: Any) -> tuple[Any, ...]:
-        if not connection.msgdef.data:
-            return self._without_definition()
-        key = (connection.msgtype, connection.msgdef)
-        if key not in self._own:
-            self._own[key] = (self._defined(connection),)
-        return self._own[key]
-
-    def _defined(self, connection: Any) -> Any:
-        typesys, text = self._typesys, connection.msgdef.data
-        if connection.msgdef.format.name == "MSG":
-            types = typesys.get_types_from_msg(text, connection.msgtype)
+    def defined(type_: str, definition: Any) -> Any:
+        if definition.format.name == "MSG":
+            types = typesys.get_types_from_msg(definition.data, type_)
         else:
             types = {}
-            for part in text.split("=" * 80 + "\n"):
+            for part in definition.data.split("=" * 80 + "\n"):
                 if part.strip():
                     types |= typesys.get_types_from_idl(part.partition("\n")[2] if part.startswith("IDL:") else part)
         store = typesys.get_typestore(typesys.Stores.EMPTY)
         store.register(types)
         return store
 
-    def _without_definition(self) -> tuple[Any, ...]:
-        if not self._others:
-            stores = []
-            for newer in LAYOUTS:
-                store = self._typesys.get_typestore(self._typesys.Stores.LATEST)
-                types = {}
-                for name, text in {**LAYOUTS[0], **newer}.items():
-                    if name not in store.fielddefs:
-                        types |= self._typesys.get_types_from_msg(text, name)
-                store.register(types)
-                stores.append(store)
-            self._others = tuple(stores)
-        return self._others
+    @cache
+    def undefined() -> tuple[Any, ...]:
+        found = []
+        for newer in _LAYOUTS:
+            store = typesys.get_typestore(typesys.Stores.LATEST)
+            types = {}
+            for name, text in {**_LAYOUTS[0], **newer}.items():
+                if name not in store.fielddefs:
+                    types |= typesys.get_types_from_msg(text, name)
+            store.register(types)
+            found.append(store)
+        return tuple(found)
+
+    return stores
 
 
-def _topics(connections: Sequence[Any], known: _Known) -> tuple[dict[str, _Topic], list[str]]:
+def _topics(connections: Sequence[Any], typesys: Any) -> tuple[dict[str, _Topic], list[str]]:
     """Topics by name, and the names of those whose type is not known or is not one and the same."""
+    stores_of = _stores_of(typesys)
     by_name: dict[str, list[Any]] = {}
     for connection in connections:
         by_name.setdefault(printable(connection.topic), []).append(connection)
@@ -180,7 +173,7 @@ def _topics(connections: Sequence[Any], known: _Known) -> tuple[dict[str, _Topic
                 raise ValueError("messages of several types")
             if not all(getattr(c.ext, "serialization_format", "cdr") in ("cdr", "") for c in own):
                 raise ValueError("messages that are not CDR")
-            stores = known.stores(first)
+            stores = stores_of(first.msgtype, first.msgdef)
             definitions = stores[0].fielddefs
             stamp, fields = _stamp_field(definitions, first.msgtype), numeric_fields(definitions, first.msgtype)
         except Exception:  # a definition that cannot be parsed leaves out its topic, not the bag
@@ -216,3 +209,51 @@ def _stamp_field(definitions: Mapping[str, Any], type_: str) -> str | None:
     if kind == _NAME and dict(definitions[what][1]).get("stamp") == (_NAME, _TIME):
         return "header.stamp"
     return None
+
+
+# Message types of Autoware and of Ackermann drives, for bags that do not bring their definitions along: ROS 2 recorded
+# to SQLite without them until Iron. Fields and their order are all that the bytes need. Where a type has changed, the
+# layouts stand one after the other, the newest first; a message fits one of them only.
+_SENT = "builtin_interfaces/Time stamp\n"
+_TIMES = _SENT + "builtin_interfaces/Time control_time\n"
+_HEADER = "std_msgs/Header header\n"
+_STEERING = "float32 steering_tire_angle\nfloat32 steering_tire_rotation_rate\n"
+_LATERAL = _STEERING + "bool is_defined_steering_tire_rotation_rate\n"
+_LONGITUDINAL = (
+    "float32 velocity\nfloat32 acceleration\nfloat32 jerk\nbool is_defined_acceleration\nbool is_defined_jerk\n"
+)
+_VELOCITY = _HEADER + "float32 longitudinal_velocity\nfloat32 lateral_velocity\nfloat32 heading_rate\n"
+_CONTROL = "Lateral lateral\nLongitudinal longitudinal\n"
+_ACKERMANN = (
+    "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\nfloat32 acceleration\nfloat32 jerk\n"
+)
+
+_LAYOUTS: tuple[Mapping[str, str], ...] = (
+    {
+        "autoware_control_msgs/msg/Control": _TIMES + _CONTROL,
+        "autoware_control_msgs/msg/Lateral": _TIMES + _LATERAL,
+        "autoware_control_msgs/msg/Longitudinal": _TIMES + _LONGITUDINAL,
+        "autoware_vehicle_msgs/msg/VelocityReport": _VELOCITY,
+        "autoware_vehicle_msgs/msg/ControlModeReport": _SENT + "uint8 mode\n",
+        "autoware_vehicle_msgs/msg/SteeringReport": _SENT + "float32 steering_tire_angle\n",
+        "autoware_vehicle_msgs/msg/GearReport": _SENT + "uint8 report\n",
+        "autoware_auto_control_msgs/msg/AckermannControlCommand": (
+            _SENT + "AckermannLateralCommand lateral\nLongitudinalCommand longitudinal\n"
+        ),
+        "autoware_auto_control_msgs/msg/AckermannLateralCommand": _SENT + _STEERING,
+        "autoware_auto_control_msgs/msg/LongitudinalCommand": (
+            _SENT + "float32 speed\nfloat32 acceleration\nfloat32 jerk\n"
+        ),
+        "autoware_auto_vehicle_msgs/msg/VelocityReport": _VELOCITY,
+        "autoware_auto_vehicle_msgs/msg/ControlModeReport": _SENT + "uint8 mode\n",
+        "autoware_auto_vehicle_msgs/msg/SteeringReport": _SENT + "float32 steering_tire_angle\n",
+        "ackermann_msgs/msg/AckermannDrive": _ACKERMANN,
+        "ackermann_msgs/msg/AckermannDriveStamped": _HEADER + "AckermannDrive drive\n",
+    },
+    {
+        "autoware_control_msgs/msg/Control": _SENT + _CONTROL,
+        "autoware_control_msgs/msg/Lateral": _SENT + _LATERAL,
+        "autoware_control_msgs/msg/Longitudinal": _SENT + _LONGITUDINAL,
+    },
+)
+"""By type: the fields, one a line, as in a ``.msg`` file. A later entry replaces those of the first for its types."""

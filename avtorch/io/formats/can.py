@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats import kinds
 from avtorch.io.formats.kinds import Kind, guarded, library, reason
-from avtorch.io.formats.listed import Channel, Listed
+from avtorch.io.formats.listed import Channel, Recording
 from avtorch.io.opening import MOST_BYTES, place, read_regular
 
 _NEED = "an undamaged BLF, ASC or candump log"
@@ -33,8 +33,8 @@ class _Message:
     channels: dict[str, str]
 
 
-def open_file(path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None = None) -> Listed:
-    """Open a CAN log with its databases; one pass over the log finds which messages it holds.
+def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
+    """Open a CAN log with the database beside it; one pass over the log finds which messages it holds.
 
     Channels are ``Message.Signal``, of those messages that the log holds. Time is that of the log: from its start in
     ASC, since 1970 in BLF and candump. Values are physical, and those that the database names by texts are their
@@ -43,7 +43,7 @@ def open_file(path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.P
     a remark.
     """
     source = place(path)
-    messages, units = _messages_of(_databases_of(Path(path), dbc, source), source, kind)
+    messages, units = _messages_of(_database_of(Path(path), source), source, kind)
     frames = _Frames(Path(path), kind, source)
     present = {key: own for key, own in messages.items() if key in frames.bus}
     names = [name for own in present.values() for one in own for name in one.channels.values()]
@@ -80,7 +80,7 @@ def open_file(path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.P
             name: Channel(name, *(np.array(x, dtype=np.float64) for x in column)) for name, column in columns.items()
         }
 
-    return Listed(source, kind.words, names, {n: units[n] for n in names if n in units}, frames.remarks, load)
+    return Recording(source, kind.words, names, {n: units[n] for n in names if n in units}, frames.remarks, load)
 
 
 class _Frames:
@@ -152,57 +152,43 @@ class _Frames:
         return (can.ASCReader if self._kind is kinds.ASC else can.CanutilsLogReader)(text), text
 
 
-def _databases_of(log: Path, named: Sequence[str | os.PathLike[str]] | None, source: str) -> list[Path]:
-    """The databases that decode `log`: those `named`; else the one beside it of its name; else the folder's only one.
+def _database_of(log: Path, source: str) -> Path:
+    """The database that decodes `log`: the one beside it of its name, else the folder's only one.
 
     Raises InputError where there is none, or more than one and none of the log's name.
     """
-    if named is not None:
-        if not named:
-            raise InputError(f"{source}: dbc names no database; one is needed")
-        return [Path(path) for path in named]
     found = sorted(path for path in log.parent.iterdir() if path.suffix.lower() == ".dbc" and path.is_file())
-    own = [path for path in found if path.stem == log.stem]
-    if own:
-        return own[:1]
-    if len(found) == 1:
-        return found
+    own = next((path for path in found if path.stem == log.stem), None)
+    if own is not None or len(found) == 1:
+        return own or found[0]
     what = f"its folder holds {len(found)}: {listed(path.name for path in found)}" if found else "found none beside it"
     raise InputError(
-        f"{source}: is a CAN log, which a DBC database decodes; {what}; "
-        f"name one by dbc, or {log.stem}.dbc beside the log"
+        f"{source}: is a CAN log, which a DBC database decodes; {what}; needs {log.stem}.dbc beside the log"
     )
 
 
-def _messages_of(
-    databases: Sequence[Path], source: str, kind: Kind
-) -> tuple[dict[Identifier, list[_Message]], dict[str, str]]:
+def _messages_of(database: Path, source: str, kind: Kind) -> tuple[dict[Identifier, list[_Message]], dict[str, str]]:
     """Messages by identifier and whether that is an extended one, and the units of their channels.
 
-    A channel is ``Message.Signal``; where another message has that name already, the database's name comes first.
+    A channel is ``Message.Signal``; where another message has that name already, the identifier stands between.
     Raises InputError.
     """
     cantools = library("cantools.database", source, kind)
     messages: dict[Identifier, list[_Message]] = {}
     units: dict[str, str] = {}
-    taken: set[str] = set()
-    for path in databases:
-        text = read_regular(path, most=_MOST_DBC, need=_NEED_DBC).decode("cp1252", errors="replace")
-        with guarded(place(path), _NEED_DBC):
-            database = cantools.load_string(text, database_format="dbc", strict=False)
-            for message in database.messages:
-                if message.is_container:
-                    continue
-                prefix = f"{message.name}."
-                if any(prefix + signal.name in taken for signal in message.signals):
-                    prefix = f"{path.stem}.{message.name}."
-                if any(prefix + signal.name in taken for signal in message.signals):
-                    prefix = f"{path.stem}.{message.name}.{message.frame_id:X}."
-                channels = {signal.name: prefix + signal.name for signal in message.signals}
-                taken |= set(channels.values())
-                units |= {channels[signal.name]: signal.unit for signal in message.signals if signal.unit}
-                key = (message.frame_id, bool(message.is_extended_frame))
-                messages.setdefault(key, []).append(_Message(message, channels))
+    text = read_regular(database, most=_MOST_DBC, need=_NEED_DBC).decode("cp1252", errors="replace")
+    with guarded(place(database), _NEED_DBC):
+        taken: set[str] = set()
+        for message in cantools.load_string(text, database_format="dbc", strict=False).messages:
+            if message.is_container:
+                continue
+            twice = message.name in taken
+            prefix = f"{message.name}.{message.frame_id:X}." if twice else f"{message.name}."
+            taken.add(message.name)
+            channels = {signal.name: prefix + signal.name for signal in message.signals}
+            units |= {channels[signal.name]: signal.unit for signal in message.signals if signal.unit}
+            key = (message.frame_id, bool(message.is_extended_frame))
+            messages.setdefault(key, []).append(_Message(message, channels))
     if not messages:
-        raise InputError(f"{listed(place(path) for path in databases)}: defines no message; {_NEED_DBC} is needed")
+        raise InputError(f"{place(database)}: defines no message; {_NEED_DBC} is needed")
     return messages, units

@@ -1,166 +1,109 @@
 """Workbooks by python-calamine: Excel (xlsx, xlsm, xlsb, xls) and OpenDocument (ods), the first sheet with a table.
 
-A table is a row of names, perhaps a row of units below it, then rows of numbers.
+A sheet is read as a table of text is (`avtorch.io.tables`): lines before the header, a row of names, perhaps a row of
+units, rows of numbers.
 """
 
 from __future__ import annotations
 
+import csv
 import datetime as dt
 import io
-import math
 import os
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from itertools import chain, islice
 from typing import Any
 
 import numpy as np
 
-from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats.kinds import Kind, guarded, library
-from avtorch.io.formats.listed import Channel, Listed, refuse_cells
+from avtorch.io.formats.listed import Channel, Recording, refuse_cells
 from avtorch.io.formats.matlab import FINER, TIMES
-from avtorch.io.opening import MOST_BYTES, MOST_COLUMNS, place, read_regular
+from avtorch.io.opening import MOST_BYTES, place, read_regular
+from avtorch.io.tables import Readings, Table, text_table
 
 _NEED = "an undamaged workbook"
 _SCALES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
-_AHEAD = 200  # rows searched for the names
-_EPOCH = dt.datetime(1970, 1, 1)
 _UNIT = re.compile(r"\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*$")
 
 
-@dataclass(frozen=True)
-class SheetTable:
-    """Names, units and numbers ``(row, column)`` of a sheet; NaN for an empty cell and for a text."""
-
-    names: tuple[str, ...]
-    units: dict[str, str]
-    numbers: FloatArray
-    texts: int
-    """Cells among the numbers that hold a text."""
-
-
-def open_file(path: str | os.PathLike[str], kind: Kind) -> Listed:
+def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
     """Open a workbook; the sheet is read at once.
 
     Channels are its columns of numbers, called as in the row of names; NaN for an empty cell or a text. Time is the
     column called time, t, timestamp or the like, in seconds unless its unit says otherwise, since 1970 where its cells
-    are dates. Rows without a time are left out. Raises InputError.
+    are dates. Rows without a time and columns that share a name are left out. Raises InputError.
     """
     source = place(path)
     calamine = library("python_calamine", source, kind)
     with guarded(source, _NEED):
         book = calamine.load_workbook(io.BytesIO(read_regular(path, most=MOST_BYTES, need=_NEED)))
         sheets = list(book.sheet_names)
-        tables = ((name, table_of(book.get_sheet_by_name(name).iter_rows(), source)) for name in sheets)
-        sheet, table = next(((name, one) for name, one in tables if one is not None and one.names), ("", None))
-    if table is None:
+        tables = ((name, sheet_table(book.get_sheet_by_name(name).iter_rows(), source)) for name in sheets)
+        sheet, found = next(((name, one) for name, one in tables if one is not None), ("", None))
+    if found is None:
         raise InputError(
             f"{source}: no sheet has a row of names and rows of numbers below it; sheets: {listed(sheets)}"
         )
-    plain = [_UNIT.sub("", name).strip().lower() for name in table.names]
-    at = next((plain.index(name) for name in (*TIMES, *FINER) if name in plain), None)
-    if at is None:
+    table, columns = found
+    bracketed = {name: match[1] or match[2] for name in columns if (match := _UNIT.search(name)) is not None}
+    units = {name: unit for name in columns if (unit := table.units.get(name) or bracketed.get(name))}
+    plain = {_UNIT.sub("", name).strip().lower(): name for name in reversed(columns)}
+    clock = next((name for name in (*TIMES, *FINER) if name in plain), None)
+    if clock is None:
         raise InputError(
             f"{source}: no column is called {', '.join(TIMES[:4])} or the like; a time column is needed; "
-            f"columns: {listed(table.names)}"
+            f"columns: {listed(columns)}"
         )
-    scale = _SCALES.get(table.units.get(table.names[at], "").lower(), FINER.get(plain[at], 1.0))
-    time = table.numbers[:, at] * scale
+    stated = units.pop(plain[clock], "").strip("[]() ").lower()
+    time = columns.pop(plain[clock]).values * _SCALES.get(stated, FINER.get(clock, 1.0))
     dated = ~np.isnan(time)
+    time = time[dated]
     remarks = []
     if len(sheets) > 1:
         remarks.append(f"sheet {quoted(sheet)} is read, {len(sheets) - 1} others are not")
-    if table.texts:
-        remarks.append(f"{table.texts} cells hold a text where a number is expected; they are NaN")
+    if twice := sorted({name for name in table.names if table.names.count(name) > 1}):
+        remarks.append(f"columns that share a name are left out: {listed(twice)}")
+    if texts := sum(len(column.faults) for column in columns.values()):
+        remarks.append(f"{texts} cells hold a text where a number is expected; they are NaN")
     if not dated.all():
         remarks.append(f"{int((~dated).sum())} rows without a time are left out")
-    time = time[dated]
-    columns = {name: table.numbers[dated, i] for i, name in enumerate(table.names) if i != at}
-    units = {name: unit for name, unit in table.units.items() if name in columns}
-    return Listed(
-        source, kind.words, columns, units, remarks,
-        lambda names: {name: Channel(name, time, columns[name]) for name in names},
+    return Recording(
+        source, kind.words, columns, {name: unit.strip("[]() ") for name, unit in units.items()}, remarks,
+        lambda names: {name: Channel(name, time, columns[name].values[dated]) for name in names},
     )  # fmt: skip
 
 
-def table_of(rows: Iterable[Sequence[Any]], source: str) -> SheetTable | None:
-    """The table of a sheet, None where there is none. Columns without any number are left out.
-
-    Raises InputError beyond 10,000 columns or 20 million cells.
-    """
-    left = iter(rows)
-    ahead = list(islice(left, _AHEAD))
-    for i, row in enumerate(ahead):
-        if not _is_header(row):
-            continue
-        below = next((k for k in range(i + 1, min(i + 3, len(ahead))) if _numbers(ahead[k]) >= 1), None)
-        if below is None or (below == i + 2 and _numbers(ahead[i + 1])):
-            continue
-        return _table(row, ahead[i + 1] if below == i + 2 else (), chain(ahead[below:], left), source)
-    return None
-
-
-def _is_header(row: Sequence[Any]) -> bool:
-    texts = [cell for cell in row if cell != ""]
-    return len(texts) >= 2 and all(isinstance(cell, str) for cell in texts)
-
-
-def _numbers(row: Sequence[Any]) -> int:
-    return sum(not isinstance(cell, str) for cell in row)
-
-
-def _table(head: Sequence[str], below: Sequence[Any], rows: Iterable[Sequence[Any]], source: str) -> SheetTable:
-    places = [i for i, name in enumerate(head) if name.strip()]
-    if len(places) > MOST_COLUMNS:
-        raise InputError(f"{source}: has {len(places):,} columns; needs {MOST_COLUMNS:,} at most")
-    lines: list[list[float]] = []
-    texts = [0] * len(places)
+def sheet_table(rows: Iterable[Sequence[Any]], source: str) -> tuple[Table, dict[str, Readings]] | None:
+    """The table of a sheet and its columns of numbers or times; None where it has none."""
+    text, cells = io.StringIO(newline=""), 0
+    writer = csv.writer(text, delimiter="\t")
     for row in rows:
-        if all(cell == "" for cell in row):
-            continue
-        refuse_cells(source, (len(lines) + 1) * len(places))
-        line = [_number(row[i]) if i < len(row) else math.nan for i in places]
-        for k, i in enumerate(places):
-            texts[k] += i < len(row) and isinstance(row[i], str) and row[i] != "" and math.isnan(line[k])
-        lines.append(line)
-    numbers = np.array(lines, dtype=np.float64).reshape(len(lines), len(places))
-    kept = ~np.all(np.isnan(numbers), axis=0)
-    names: list[str] = []
-    units: dict[str, str] = {}
-    for i, is_number in zip(places, kept, strict=True):
-        if not is_number:
-            continue
-        name = base = head[i].strip()
-        count = 1
-        while name in names:
-            count += 1
-            name = f"{base} ({count})"
-        names.append(name)
-        unit = str(below[i]).strip() if i < len(below) else ""
-        if not unit and (match := _UNIT.search(base)) is not None:
-            unit = (match[1] if match[1] is not None else match[2]).strip()
-        unit = unit.strip("[]() ")
-        if unit:
-            units[name] = unit
-    return SheetTable(tuple(names), units, numbers[:, kept], sum(n for n, k in zip(texts, kept, strict=True) if k))
-
-
-def _number(cell: Any) -> float:
-    """A cell as a number: a date in seconds since 1970, a time of day or a span in seconds."""
-    if isinstance(cell, (bool, int, float)):
-        return float(cell)
-    if isinstance(cell, dt.datetime):
-        return (cell.replace(tzinfo=None) - _EPOCH) / dt.timedelta(seconds=1)
-    if isinstance(cell, dt.date):
-        return (dt.datetime(cell.year, cell.month, cell.day) - _EPOCH) / dt.timedelta(seconds=1)
-    if isinstance(cell, dt.timedelta):
-        return cell / dt.timedelta(seconds=1)
-    if isinstance(cell, dt.time):
-        return cell.hour * 3600 + cell.minute * 60 + cell.second + cell.microsecond / 1e6
+        cells += len(row)
+        refuse_cells(source, cells)
+        writer.writerow(map(_text, row))
     try:
-        return float(cell)
-    except ValueError:
-        return math.nan
+        table = text_table(source, text.getvalue(), None)
+    except InputError:  # no row of names
+        return None
+    columns = {
+        name: table.readings(name, empty_is_nan=True, as_time=True)
+        for name in table.names
+        if table.names.count(name) == 1
+    }
+    columns = {name: column for name, column in columns.items() if np.isfinite(column.values).any()}
+    return (table, columns) if columns else None
+
+
+def _text(cell: Any) -> str:
+    """A cell as text: a number in full, a span in seconds, a date or a time of day in ISO's form."""
+    if isinstance(cell, dt.datetime):
+        return cell.replace(tzinfo=None).isoformat()
+    if isinstance(cell, dt.date):
+        return f"{cell.isoformat()}T00:00:00"
+    if isinstance(cell, dt.time):
+        return cell.isoformat()
+    if isinstance(cell, dt.timedelta):
+        return repr(cell / dt.timedelta(seconds=1))
+    return repr(float(cell)) if isinstance(cell, (bool, int, float)) else str(cell or "")

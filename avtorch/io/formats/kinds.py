@@ -117,8 +117,11 @@ def kind_at(path: str | os.PathLike[str]) -> Kind | None:
     return None
 
 
-def is_kind(path: str | os.PathLike[str]) -> bool:
-    """Whether the file at `path` is a recording by its content or by its name; False where there is none."""
+def is_recording(path: str | os.PathLike[str]) -> bool:
+    """Whether the file at `path` is a recording: by its first bytes, or by its suffix where they are damaged.
+
+    False for CSV, Parquet, and where there is no such file. Reads at most 4096 bytes and loads no library.
+    """
     file = Path(path)
     try:
         return kind_at(path) is not None

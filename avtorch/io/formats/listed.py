@@ -5,11 +5,10 @@ A signal is listed before it is read, so that a file of thousands of signals cos
 
 from __future__ import annotations
 
-import difflib
 from array import array
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -37,41 +36,13 @@ class Channel:
                 )
 
 
-class Recording(Protocol):
-    """An opened file of channels."""
+class Recording:
+    """An opened file: the file as messages name it (`source`), its `form` in words, such as ``MDF 4.10``, all numeric
+    channels (`names`) in the file's order, their `units` as far as the file states them, and `remarks` on what was
+    salvaged, left out or guessed.
 
-    @property
-    def source(self) -> str:
-        """The file as messages name it."""
-        ...
-
-    @property
-    def form(self) -> str:
-        """The format in words, such as ``MDF 4.10`` or ``ROS 2 bag (MCAP)``."""
-        ...
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """All numeric channels, each name once, in the file's order."""
-        ...
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Units by channel, as the file states them, for those that state one."""
-        ...
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """What was salvaged, left out or guessed while opening, in sentences."""
-        ...
-
-    def read(self, names: Collection[str]) -> dict[str, Channel]:
-        """Channels by name. Raises `InputError` naming file and channel for one that is not there or is damaged."""
-        ...
-
-
-class Listed:
-    """A `Recording` whose names are known; `load` reads those that are asked for, each once, and at least one."""
+    `load` reads channels that are asked for, each once, and at least one. Raises InputError for a file of no channel.
+    """
 
     def __init__(
         self,
@@ -103,14 +74,11 @@ class Listed:
             raise InputError(f"{self.source}: {len(asked):,} channels are asked for; {MOST_COLUMNS:,} at most can be")
         for name in asked:
             if name not in self._known:
-                raise InputError(f"{self.source}: channel {quoted(name, 80)} is missing; {self._nearest(name)}")
+                there = listed(self.names)
+                raise InputError(f"{self.source}: channel {quoted(name, 80)} is missing; channels: {there}")
         found = self._load(asked) if asked else {}
         refuse_cells(self.source, sum(len(channel.values) for channel in found.values()))
         return {name: found[name] for name in asked}
-
-    def _nearest(self, name: str) -> str:
-        near = difflib.get_close_matches(name, self.names[:MOST_COLUMNS], n=3, cutoff=0.5)
-        return f"the nearest: {', '.join(quoted(n, 80) for n in near)}" if near else f"channels: {listed(self.names)}"
 
 
 def refuse_cells(source: str, count: int) -> None:
@@ -146,7 +114,7 @@ def topic_recording(
     fields: Mapping[str, tuple[str, Any]],
     remarks: Sequence[str],
     collect: Callable[[Mapping[str, Sequence[Any]], Mapping[str, Piece]], None],
-) -> Listed:
+) -> Recording:
     """A recording of topics of messages, all fields of one topic on one clock.
 
     `fields`: the topic and the path within its messages, by channel. `collect` puts the messages of topics into their
@@ -169,4 +137,4 @@ def topic_recording(
                 found[name] = Channel(name, time, np.array(column, dtype=np.float64))
         return found
 
-    return Listed(source, form, fields, {}, remarks, load)
+    return Recording(source, form, fields, {}, remarks, load)

@@ -19,7 +19,7 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats import kinds
 from avtorch.io.formats.kinds import Kind, guarded, library, reason
-from avtorch.io.formats.listed import Channel, Listed, refuse_cells
+from avtorch.io.formats.listed import Channel, Recording, refuse_cells
 from avtorch.io.opening import MOST_COLUMNS, opened, place
 
 TIMES = ("time", "t", "timestamp", "timestamps", "time_s", "t_s", "tout", "seconds", "elapsed", "sec")
@@ -30,7 +30,6 @@ FINER |= {"t_us": 1e-6, "time_ns": 1e-9, "timestamp_ns": 1e-9, "t_ns": 1e-9}
 
 _NEED = "an undamaged MAT file"
 _NUMBERS = "fiub"  # kinds of numbers of NumPy
-_MOST_WIDE = 1000  # columns of a matrix that are channels
 _MOST_IN_ARRAY = 100  # elements of an array of structs, each of which is a struct of signals
 _DEEPEST = 16
 _TABLES = ("table", "timetable")
@@ -38,59 +37,25 @@ _PLAIN = {"double", "single", "logical", "char", "cell", "struct", "sparse", "fu
 _PLAIN |= {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)}
 
 
+Tree: TypeAlias = "Mapping[str, Any | Tree]"
+"""Structs within structs; leaves are arrays, or datasets of HDF5 that are not read yet."""
+
+
 @dataclass(frozen=True, eq=False)
-class Matrix:
-    """Numbers of a `shape` as MATLAB shows it: an array, or a dataset of HDF5 that is not `transposed` yet."""
+class Series:
+    """One channel: its `values` and its `time`, vectors of a file, and the time's unit [s]."""
 
     values: Any
-    transposed: bool = False
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return tuple(reversed(self.values.shape)) if self.transposed else self.values.shape
-
-    @property
-    def length(self) -> int:
-        return math.prod(self.shape)
-
-    @property
-    def is_vector(self) -> bool:
-        return self.length > 0 and self.length == max(self.shape, default=0)
-
-    def load(self) -> FloatArray:
-        """The numbers, in that shape. Raises an error of the library where they are damaged."""
-        loaded = np.array(self.values[()], dtype=np.float64)
-        return loaded.T if self.transposed else loaded
-
-
-Tree: TypeAlias = "Mapping[str, Matrix | Tree]"
-
-
-@dataclass(frozen=True)
-class Series:
-    """One channel: a vector of a matrix, by its index along `axis` (-1: the matrix is one), and its time."""
-
-    matrix: Matrix
-    axis: int
-    index: int
-    time: Matrix
+    time: Any
     scale: float
 
-    def vector(self, whole: FloatArray) -> FloatArray:
-        """The samples of the channel (sample,), out of the numbers of its matrix."""
-        if self.axis < 0:
-            return whole.reshape(-1)
-        squeezed = whole.reshape([n for n in whole.shape if n != 1])
-        return np.asarray(squeezed.take(self.index, axis=self.axis), dtype=np.float64)
 
-
-def open_file(path: str | os.PathLike[str], kind: Kind) -> Listed:
+def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
     """Open a MAT file and find its signals; vectors of version 7.3 are read when asked for.
 
-    Channels are vectors, by their path in structs as in ``log.speed``, columns as ``wheel(2)``. Their time is a vector
-    of as many samples called time, t, timestamp or the like, in the same struct or around it, in seconds unless its
-    name says ms, us or ns. A struct of Time and Data is one channel. A table is read as a struct, a timetable with its
-    times. Raises InputError.
+    Channels are vectors, by their path in structs as in ``log.speed``. Their time is a vector of as many samples called
+    time, t, timestamp or the like, in the same struct or around it, in seconds unless its name says ms, us or ns. A
+    struct of Time and Data is one channel. A table is read as a struct, a timetable with its times. Raises InputError.
     """
     source = place(path)
     objects: list[str] = []
@@ -108,24 +73,33 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Listed:
         )
 
     def load(names: tuple[str, ...]) -> dict[str, Channel]:
-        refuse_cells(source, sum(found.series[name].time.length for name in names))
-        # the time and a matrix are read once for all channels that they have
-        loaded: dict[int, FloatArray] = {}
-        times: dict[tuple[int, float], FloatArray] = {}
+        refuse_cells(source, sum(_length(found.series[name].time) for name in names))
+        times: dict[tuple[int, float], FloatArray] = {}  # read once for all channels that have it
         channels = {}
         for name in names:
             series = found.series[name]
+            key = (id(series.time), series.scale)
             with guarded(f"{source}: channel {quoted(name, 80)}", _NEED):
-                for matrix in (series.time, series.matrix):
-                    if id(matrix) not in loaded:
-                        loaded[id(matrix)] = matrix.load()
-                key = (id(series.time), series.scale)
-                times.setdefault(key, loaded[id(series.time)].reshape(-1) * series.scale)
-                channels[name] = Channel(name, times[key], series.vector(loaded[id(series.matrix)]))
+                if key not in times:
+                    times[key] = vector(series.time) * series.scale
+                channels[name] = Channel(name, times[key], vector(series.values))
         return channels
 
     untimed = [f"left out, no time goes with them: {listed(found.untimed)}"] if found.untimed else []
-    return Listed(source, form, found.series, {}, untimed + lost, load)
+    return Recording(source, form, found.series, {}, untimed + lost, load)
+
+
+def vector(leaf: Any) -> FloatArray:
+    """The numbers of a vector (sample,). Raises an error of the library where they are damaged."""
+    return np.array(leaf[()], dtype=np.float64).reshape(-1)
+
+
+def _length(leaf: Any) -> int:
+    return math.prod(leaf.shape)
+
+
+def _is_vector(leaf: Any) -> bool:
+    return _length(leaf) == max(leaf.shape, default=0) > 0
 
 
 def _tree_5(path: str | os.PathLike[str], kind: Kind, objects: list[str]) -> Tree:
@@ -151,7 +125,7 @@ def _tree_5(path: str | os.PathLike[str], kind: Kind, objects: list[str]) -> Tre
                     here = name if len(flat) == 1 else f"{name}({k + 1})"
                     tree[here] = tree_of({n: one[n] for n in kind.names}, full, depth + 1)
             elif kind.names is None and kind.kind in _NUMBERS and isinstance(value, np.ndarray):
-                tree[str(name)] = Matrix(value)
+                tree[str(name)] = value
         return tree
 
     return tree_of({k: v for k, v in content.items() if not k.startswith("__")}, "", 0)
@@ -184,7 +158,7 @@ def _tree_73(path: str | os.PathLike[str], kind: Kind, objects: list[str]) -> Tr
                 if depth < _DEEPEST:
                     tree[name] = tree_of(item, full, depth + 1)
             elif is_number(item):
-                tree[name] = Matrix(item, transposed=True)
+                tree[name] = item
         return tree
 
     return tree_of(h5py.File(opened(path, need=_NEED), "r"), "", 0)
@@ -216,17 +190,17 @@ def _tables(path: str | os.PathLike[str], nested: list[str]) -> tuple[dict[str, 
     return trees, [f"timeseries and other objects cannot be read, save them as structs: {listed(lost)}"] if lost else []
 
 
-def _columns(frame: Any) -> dict[str, Matrix]:
+def _columns(frame: Any) -> dict[str, np.ndarray]:
     """The numeric columns of a data frame; its index as ``time`` where that is of times."""
-    found: dict[str, Matrix] = {}
+    found: dict[str, np.ndarray] = {}
     stamps = _seconds(frame.index.to_numpy())
     if stamps is not None:
-        found["time"] = Matrix(stamps)
+        found["time"] = stamps
     for name in frame.columns:
         values = frame[name].to_numpy()
         numbers = values if values.dtype.kind in _NUMBERS else _seconds(values)
         if numbers is not None and str(name) not in found:
-            found[str(name)] = Matrix(numbers)
+            found[str(name)] = numbers
     return found
 
 
@@ -244,47 +218,30 @@ class _Found:
     series: dict[str, Series] = field(default_factory=dict)
     untimed: list[str] = field(default_factory=list)
 
-    def visit(self, tree: Tree, path: str, outer: tuple[str, Matrix, float] | None, depth: int) -> None:
+    def visit(self, tree: Tree, path: str, outer: tuple[str, Any, float] | None, depth: int) -> None:
         """Take in the vectors of a tree; `outer`: name, numbers and unit [s] of the time around it."""
         if depth > _DEEPEST or len(self.series) >= MOST_COLUMNS:
             return
-        clock = _clock(tree) or outer
-        own = clock[0] if clock is not None and clock is not outer else None
-        values = [name for name in tree if name != own]
+        own = _clock(tree)
+        clock = own or outer
+        values = [name for name in tree if own is None or name != own[0]]
         for name in values:
             item = tree[name]
             full = f"{path}.{name}" if path else name
             if isinstance(item, Mapping):
                 self.visit(item, full, clock, depth + 1)
-            elif clock is None:
-                if item.length > 1:
-                    self.untimed.append(full)
-            else:
+            elif clock is not None and _is_vector(item) and _length(item) == _length(clock[1]) > 1:
                 # a struct of Time and Data alone is one signal, called as the struct is
                 alone = path and own is not None and len(values) == 1 and name.lower() in ("data", "values", "value")
-                self._add(path if alone else full, item, *clock[1:])
-
-    def _add(self, name: str, item: Matrix, time: Matrix, scale: float) -> None:
-        samples = time.length
-        if samples < 2 and item.length < 2:
-            return
-        if item.is_vector and item.length == samples:
-            self.series[name] = Series(item, -1, 0, time, scale)
-            return
-        wide = [n for n in item.shape if n != 1]
-        if len(wide) == 2 and samples in wide:
-            axis = 1 if wide[0] == samples else 0  # columns first, where a matrix is square
-            for k in range(min(wide[axis], _MOST_WIDE, MOST_COLUMNS - len(self.series))):
-                self.series[f"{name}({k + 1})"] = Series(item, axis, k, time, scale)
-        elif item.length > 1:
-            self.untimed.append(name)
+                self.series[path if alone else full] = Series(item, *clock[1:])
+            elif _length(item) > 1:
+                self.untimed.append(full)
 
 
-def _clock(tree: Tree) -> tuple[str, Matrix, float] | None:
+def _clock(tree: Tree) -> tuple[str, Any, float] | None:
     lower = {name.lower(): name for name in reversed(list(tree))}
     for wanted, scale in [*((name, 1.0) for name in TIMES), *FINER.items()]:
         name = lower.get(wanted)
-        item = tree[name] if name is not None else None
-        if name is not None and item is not None and not isinstance(item, Mapping) and item.is_vector:
-            return name, item, scale
+        if name is not None and not isinstance(tree[name], Mapping) and _is_vector(tree[name]):
+            return name, tree[name], scale
     return None

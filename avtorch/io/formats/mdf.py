@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import re
 from collections import Counter
 from typing import Any, BinaryIO
 
@@ -13,7 +12,7 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, quoted
 from avtorch.io.formats.kinds import Kind, guarded, library
-from avtorch.io.formats.listed import Channel, Listed, refuse_cells
+from avtorch.io.formats.listed import Channel, Recording, refuse_cells
 from avtorch.io.opening import MOST_BYTES, beginning, opened, place, read_regular
 
 _NEED = "an undamaged MDF 3 or 4 file"
@@ -23,11 +22,9 @@ _TIME, _NO_SYNC = 1, 0  # what a master counts in MDF 4; the others are an angle
 _MASTERS_4 = (2, 3)
 _VARIABLE_LENGTH = 1
 _DATES_3 = (132, 133)
-_INCOMPLETE = re.compile(r"Incomplete block at 0x([0-9a-f]+)")
-_MOST_CUT = 100  # blocks that the end of a file may cut: one of each group, where they lie behind each other
 
 
-def open_file(path: str | os.PathLike[str], kind: Kind) -> Listed:
+def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
     """Open an MDF file and list its numeric channels that have a time.
 
     Samples are physical values; a channel whose values are named by texts is read as its raw numbers, and where texts
@@ -41,13 +38,14 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Listed:
     # asammdf completes an unfinished file in place, so it gets a copy in memory
     unfinished = beginning(path, 8, need=_NEED).startswith(b"UnFin")
     with guarded(source, _NEED):
+        stream = _in_memory(path) if unfinished else opened(path, need=_NEED)
         try:
-            mdf = _loaded(asammdf, _in_memory(path) if unfinished else opened(path, need=_NEED), whole=True)
+            mdf = _loaded(asammdf, stream, whole=True)
         except asammdf.blocks.utils.MdfException as fault:
-            if _INCOMPLETE.search(str(fault)) is None:
+            if "Incomplete block" not in str(fault):
                 raise
-            mdf = _cut_off(asammdf, _in_memory(path), fault)
-            remarks.append("the file is cut off; what its end cuts is read as far as it goes, or left out")
+            mdf = _loaded(asammdf, stream, whole=False)
+            remarks.append("the file is cut off; blocks that its end cuts are left out")
         if unfinished:
             remarks.append("the recorder did not finish the file; it was completed as far as it goes")
         listing = _Listing(mdf)
@@ -74,31 +72,11 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Listed:
                 channels[name] = Channel(name, time, values)
         return channels
 
-    return Listed(source, f"MDF {mdf.version}", listing.places, listing.units, remarks + listing.remarks, load)
+    return Recording(source, f"MDF {mdf.version}", listing.places, listing.units, remarks + listing.remarks, load)
 
 
 def _in_memory(path: str | os.PathLike[str]) -> io.BytesIO:
     return io.BytesIO(read_regular(path, most=MOST_BYTES, need=_NEED))
-
-
-def _cut_off(asammdf: Any, stream: BinaryIO, fault: Exception) -> Any:
-    """A file that ends within the blocks that asammdf names: blocks of samples end there, others are left out."""
-    for _ in range(_MOST_CUT):
-        told = _INCOMPLETE.search(str(fault))
-        if told is None:
-            raise fault
-        at = int(told[1], 16)
-        end = stream.seek(0, 2)
-        stream.seek(at)
-        if stream.read(4) != b"##DT":
-            break
-        stream.seek(at + 8)
-        stream.write((end - at).to_bytes(8, "little"))
-        try:
-            return _loaded(asammdf, stream, whole=True)
-        except asammdf.blocks.utils.MdfException as next_fault:
-            fault = next_fault
-    return _loaded(asammdf, stream, whole=False)
 
 
 def _loaded(asammdf: Any, stream: BinaryIO, *, whole: bool) -> Any:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import io
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.errors import InputError, printable, quoted
-from avtorch.io.formats.kinds import Kind
+from avtorch.io.formats.kinds import Kind, guarded
 from avtorch.io.opening import MOST_BYTES, MOST_CELLS, MOST_COLUMNS, place, read_regular
 
+_NEED = "an undamaged Parquet file"
 MOST_TEXT = 100
 """Bytes of the longest text that can be a number."""
 
@@ -30,35 +30,50 @@ def is_text(kind: Any) -> bool:
     return any(check(kind) for check in (types.is_string, types.is_large_string, *views))
 
 
-def scalar_checks() -> tuple[Callable[[Any], bool], ...]:
-    """Tests of an Arrow type, one of which a column of numbers or times passes."""
+def is_time(kind: Any) -> bool:
+    """Whether an Arrow type is of dates with times or of spans."""
     from pyarrow import types
 
+    return types.is_timestamp(kind) or types.is_duration(kind)
+
+
+def readable(kind: Any) -> bool:
+    """Whether a column of an Arrow type can hold numbers or times."""
+    from pyarrow import types
+
+    kind = kind.value_type if types.is_dictionary(kind) else kind
     numbers = types.is_integer, types.is_floating, types.is_boolean, types.is_decimal, types.is_null
-    return *numbers, types.is_timestamp, types.is_duration
+    return is_text(kind) or is_time(kind) or any(check(kind) for check in numbers)
+
+
+def short_texts(column: Any, where: str) -> Any:
+    """A column without Arrow's dictionary. InputError where its texts are too long for numbers."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    if pa.types.is_dictionary(column.type):
+        texts = [chunk.dictionary for chunk in column.chunks] if is_text(column.type.value_type) else []
+    else:
+        texts = [column] if is_text(column.type) else []
+    for text in texts:
+        longest = pc.max(pc.binary_length(text)).as_py() or 0  # pyright: ignore[reportAttributeAccessIssue]
+        if longest > MOST_TEXT:
+            raise InputError(f"{where}: holds texts of {longest:,} bytes; numbers are needed")
+    return column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
 
 
 def cells_of(column: Any, where: str) -> Cells:
     """The cells of a column; a time stamp brings its own unit and becomes seconds since its epoch."""
     import pyarrow as pa
-    import pyarrow.compute as pc
 
-    column = column.combine_chunks()
-    if isinstance(column, pa.ChunkedArray):  # of several chunks that do not fit into one
-        column = pa.concat_arrays(column.chunks)
     if pa.types.is_dictionary(column.type):
-        if is_text(column.type.value_type):
-            lengths = pc.binary_length(column.dictionary)  # pyright: ignore[reportAttributeAccessIssue]
-            longest = max((n or 0 for n in lengths.to_pylist()), default=0)
-            if longest > MOST_TEXT:
-                raise InputError(f"{where}: holds texts of {longest:,} bytes; numbers are needed")
-        column = column.dictionary_decode()
+        column = short_texts(column, where)
     kind = column.type
-    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+    if is_time(kind):
         ticks = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[kind.unit]
         return [None if x is None else x / ticks for x in column.cast(pa.int64()).to_pylist()]
     if column.null_count == 0 and (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-        return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
+        return np.asarray(column.to_numpy(), dtype=np.float64)
     # text, booleans, decimals and empty cells go through the same careful reading as a CSV
     return column.to_pylist()
 
@@ -81,7 +96,7 @@ class ParquetFile:
         """
         import pyarrow as pa
 
-        with damage(self.source):
+        with guarded(self.source, _NEED):
             table = self._table(wanted)
             out = io.BytesIO()
             with pa.ipc.new_stream(out, table.schema) as writer:
@@ -90,7 +105,6 @@ class ParquetFile:
 
     def _table(self, wanted: Collection[str]) -> Any:
         import pyarrow as pa
-        import pyarrow.compute as pc
 
         count, rows, schema = Counter(self.names), self._file.metadata.num_rows, self._file.schema_arrow
         kept = [name for name in self.names if name in wanted and count[name] == 1]
@@ -100,26 +114,17 @@ class ParquetFile:
                 f"needs {MOST_CELLS:,} cells at most"
             )
         for name in kept:
-            kind = schema.field(name).type
-            kind = kind.value_type if pa.types.is_dictionary(kind) else kind
-            if not is_text(kind) and not any(check(kind) for check in scalar_checks()):
+            if not readable(kind := schema.field(name).type):
                 what = printable(str(kind), 40)
                 raise InputError(f"{self.source}: column {quoted(name)}: holds {what}; numbers are needed")
         # a column is found by the first part of its path, so that one with a dot in its name comes along
         found = self._file.read(columns=kept, use_threads=False)
         if kept and found.num_rows != rows:
             raise ValueError(f"{found.num_rows} rows where it declares {rows}")
-        columns = []
-        for name in kept:
-            column = found.column(found.schema.get_field_index(name))
-            if pa.types.is_dictionary(column.type):
-                column = column.cast(column.type.value_type)
-            if is_text(column.type):
-                longest = pc.max(pc.binary_length(column)).as_py() or 0  # pyright: ignore[reportAttributeAccessIssue]
-                if longest > MOST_TEXT:
-                    where = f"{self.source}: column {quoted(name)}"
-                    raise InputError(f"{where}: holds texts of {longest:,} bytes; numbers are needed")
-            columns.append(column)
+        columns = [
+            short_texts(found.column(found.schema.get_field_index(name)), f"{self.source}: column {quoted(name)}")
+            for name in kept
+        ]
         table = pa.table(columns, names=kept)
         table.validate(full=True)
         return table
@@ -132,20 +137,8 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> ParquetFile:
 
     source = place(path)
     raw = read_regular(path, most=MOST_BYTES, need="a CSV or Parquet file")
-    with damage(source):
+    with guarded(source, _NEED):
         found = ParquetFile(source, pq.ParquetFile(pa.BufferReader(raw)))
     if len(found.names) > MOST_COLUMNS:
         raise InputError(f"{source}: has {len(found.names):,} columns; needs {MOST_COLUMNS:,} at most")
     return found
-
-
-@contextmanager
-def damage(source: str) -> Iterator[None]:
-    """Within it, an error of pyarrow becomes an InputError."""
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as fault:
-        reason = str(fault).splitlines()[0] if str(fault) else type(fault).__name__
-        raise InputError(f"{source}: damaged Parquet file ({printable(reason, 120)})") from None

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from types import MappingProxyType
 
 
 @dataclass(frozen=True)
@@ -26,9 +25,8 @@ class Source:
 
 @dataclass(frozen=True)
 class Preset:
-    """The layout of one stack: the places of each signal by its name, such as ``accel_cmd``."""
+    """The layout of one stack, as messages call it: the places of each signal by its name, such as ``accel_cmd``."""
 
-    name: str
     words: str
     signals: Mapping[str, tuple[Source, ...]]
 
@@ -45,15 +43,14 @@ class Preset:
         return found
 
 
-def _preset(name: str, words: str, **signals: tuple[Source, ...]) -> Preset:
-    return Preset(name, words, MappingProxyType(signals))
+def _preset(words: str, **signals: tuple[Source, ...]) -> Preset:
+    return Preset(words, signals)
 
 
 _COMMAND = "/control/command/control_cmd/longitudinal"
 _ACTUATION = "/vehicle/status/actuation_status/status"
 
 AUTOWARE = _preset(
-    "autoware",
     "Autoware (ROS 2 bag)",
     # the time of a channel is its message's stamp
     accel_cmd=(Source(f"{_COMMAND}/acceleration", "m/s2"),),
@@ -66,7 +63,6 @@ AUTOWARE = _preset(
 )
 
 APOLLO = _preset(
-    "apollo",
     "Apollo (cyber record)",
     time=(Source("/apollo/canbus/chassis/header/timestamp_sec", "s"),),
     accel_cmd=(Source("/apollo/control/acceleration", "m/s2"),),
@@ -86,7 +82,6 @@ def _openpilot(*path: str, unit: str = "", when: tuple[int, ...] = ()) -> tuple[
 
 
 OPENPILOT = _preset(
-    "openpilot",
     "openpilot (qlog or rlog, exported)",
     time=(Source("logMonoTime", "ns"),),
     accel_cmd=_openpilot("carControl", "actuators", "accel", unit="m/s2"),
@@ -99,7 +94,6 @@ OPENPILOT = _preset(
 )
 
 CARLA = _preset(
-    "carla",
     "CARLA (ROS bridge)",
     accel_cmd=(Source("/carla/*/ackermann_cmd/acceleration", "m/s2"),),
     speed=(Source("/carla/*/vehicle_status/velocity", "m/s"), Source("/carla/*/speedometer/data", "m/s")),
@@ -107,16 +101,4 @@ CARLA = _preset(
     brake=(Source("/carla/*/vehicle_status/control/brake", "1"),),
 )
 
-OPENACC = _preset(
-    "openacc",
-    "OpenACC (CSV; the star is the vehicle's number; without commands)",
-    time=(Source("Time", "s"),),
-    speed=(Source("SpeedDoppler[0-9]*", "m/s"), Source("Speed[0-9]*", "m/s")),
-    accel=(Source("Accel[0-9]*", "m/s2"),),
-    spacing=(Source("Spacing[0-9]*", "m"), Source("IVS[0-9]*", "m")),
-)
-
-PRESETS: Mapping[str, Preset] = MappingProxyType(
-    {preset.name: preset for preset in (AUTOWARE, APOLLO, OPENPILOT, CARLA, OPENACC)}
-)
-"""By name, as a command would take it."""
+PRESETS = (AUTOWARE, APOLLO, OPENPILOT, CARLA)

@@ -41,30 +41,27 @@ def in_time(seconds: int = LATE_S) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def open_here(path: Path, dbc: Sequence[Path] | None = None) -> Recording:
+def open_here(path: Path) -> Recording:
     """As `open_recording`, in this process also what is read apart: most of a short test would be that one's start."""
     kind = kind_at(path)
-    if kind is None or (dbc is not None and kind.reader != "can"):
-        return open_recording(path, dbc=dbc)
-    given = {"dbc": dbc} if kind.reader == "can" else {}
-    return importlib.import_module(f"avtorch.io.formats.{kind.reader}").open_file(path, kind, **given)
+    if kind is None:
+        return open_recording(path)
+    return importlib.import_module(f"avtorch.io.formats.{kind.reader}").open_file(path, kind)
 
 
-def outcome(
-    path: Path, dbc: Sequence[Path] | None = None, seconds: int = LATE_S
-) -> tuple[Recording, dict[str, Channel]] | str:
+def outcome(path: Path, seconds: int = LATE_S) -> tuple[Recording, dict[str, Channel]] | str:
     """The recording with all of its channels, or the message that refuses it."""
     with in_time(seconds):
         try:
-            recording = open_here(path, dbc)
+            recording = open_here(path)
             return recording, recording.read(recording.names)
         except InputError as fault:
             return str(fault)
 
 
-def refused(path: Path, *words: str, dbc: Sequence[Path] | None = None) -> str:
+def refused(path: Path, *words: str) -> str:
     """The message of the InputError that opening or reading `path` raises; it names the file."""
-    said = outcome(path, dbc)
+    said = outcome(path)
     assert isinstance(said, str), "it was read"
     assert said.isprintable()
     assert len(said) < 700, said
@@ -76,7 +73,7 @@ def refused(path: Path, *words: str, dbc: Sequence[Path] | None = None) -> str:
 _MOST_SECONDS = 5  # for one content, of some kilobytes; `apart.MOST_SECONDS` is for recordings
 
 
-def survive(path: Path, contents: Sequence[bytes], dbc: Sequence[Path] | None = None) -> int:
+def survive(path: Path, contents: Sequence[bytes]) -> int:
     """How many of the `contents` are read; the others are refused as they should be.
 
     They are read in a copy of this process: a library that is to run apart may end it, by a fault of memory or because
@@ -89,7 +86,7 @@ def survive(path: Path, contents: Sequence[bytes], dbc: Sequence[Path] | None = 
             warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 warns of threads; the copy uses none
             copy = os.fork()
         if copy == 0:
-            _serve(path, contents[begun:], dbc, theirs)
+            _serve(path, contents[begun:], theirs)
         os.close(theirs)
         with os.fdopen(answers, "rb") as stream:
             said = stream.read()
@@ -104,7 +101,7 @@ def survive(path: Path, contents: Sequence[bytes], dbc: Sequence[Path] | None = 
     return read
 
 
-def _serve(path: Path, contents: Sequence[bytes], dbc: Sequence[Path] | None, answers: int) -> None:
+def _serve(path: Path, contents: Sequence[bytes], answers: int) -> None:
     """In the copy: read one after the other, and end."""
     faulthandler.disable()
     os.environ["RUST_BACKTRACE"] = "0"
@@ -112,7 +109,7 @@ def _serve(path: Path, contents: Sequence[bytes], dbc: Sequence[Path] | None, an
         limit_memory(apart_process.MOST_MEMORY)
         for content in contents:
             path.write_bytes(content)
-            os.write(answers, b"1" if _held(path, dbc) else b"0")
+            os.write(answers, b"1" if _held(path) else b"0")
         os._exit(0)
     except KeyboardInterrupt:  # still reading
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
@@ -122,8 +119,8 @@ def _serve(path: Path, contents: Sequence[bytes], dbc: Sequence[Path] | None, an
         os._exit(2)
 
 
-def _held(path: Path, dbc: Sequence[Path] | None) -> bool:
-    said = outcome(path, dbc, _MOST_SECONDS)
+def _held(path: Path) -> bool:
+    said = outcome(path, _MOST_SECONDS)
     if isinstance(said, str):
         assert said.isprintable()
         return False
@@ -132,9 +129,9 @@ def _held(path: Path, dbc: Sequence[Path] | None) -> bool:
     return True
 
 
-def survives(path: Path, raw: bytes, seed: int, *, cuts: int, flips: int, dbc: Sequence[Path] | None = None) -> int:
+def survives(path: Path, raw: bytes, seed: int, *, cuts: int, flips: int) -> int:
     """Cut and damage `raw` at places that `seed` tells; how many of these are still read."""
     rng = random.Random(seed)
     contents = [raw[: rng.randrange(len(raw))] for _ in range(cuts)]
     contents += [damaged(raw, i % KINDS, rng) for i in range(flips)]
-    return survive(path, contents, dbc)
+    return survive(path, contents)

@@ -64,7 +64,7 @@ def test_what_the_reader_refuses_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no signal with a time; a time vector is needed"):
         open_recording(path)
     recording = open_recording(mat5(path, STRUCTS))
-    with pytest.raises(InputError, match=r"channel 'log.sped' is missing; the nearest: 'log.speed'"):
+    with pytest.raises(InputError, match=r"channel 'log.sped' is missing; channels: log.speed"):
         recording.read(["log.sped"])
 
 
@@ -121,10 +121,10 @@ def test_no_process_can_be_started(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_requests_are_answered_one_by_one(tmp_path: Path) -> None:
     recording = open_here(mat5(tmp_path / "drive.mat", STRUCTS))
     out = io.BytesIO()
-    requests = [["log.speed", "log.wheel(1)"], ["none"], ["log.cmd"]]
+    requests = [["log.speed", "log.engaged"], ["none"], ["log.cmd"]]
     apart_process.serve(recording, [json.dumps(names).encode() for names in requests], out)
     out.seek(0)
-    assert json.loads(out.readline()) == {"clocks": [150], "channels": [["log.speed", 0], ["log.wheel(1)", 0]]}
+    assert json.loads(out.readline()) == {"clocks": [150], "channels": [["log.speed", 0], ["log.engaged", 0]]}
     out.read(3 * 150 * 8)
     assert "is missing" in json.loads(out.readline())["error"]
     assert json.loads(out.readline())["clocks"] == [75]

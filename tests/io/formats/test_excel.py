@@ -18,7 +18,7 @@ from odf.table import Table, TableCell, TableRow
 from odf.text import P
 
 from avtorch.errors import InputError
-from avtorch.io.formats.excel import table_of
+from avtorch.io.formats.excel import sheet_table
 
 from .survival import open_here, refused, survives
 
@@ -93,22 +93,25 @@ def test_the_first_sheet_with_a_table_is_read(tmp_path: Path, form: str) -> None
     assert channels["Speed"].time is channels["Accel [m/s2]"].time
 
 
-def table(rows: Rows) -> Any:
-    return table_of(rows, "drive.xlsx")
-
-
 def test_empty_cells_and_texts_are_nan_and_are_told(tmp_path: Path) -> None:
-    rows = [["t", "speed", "speed"], [0.0, 1.0, 5.0], [0.1, None, "fast"], [None, 3.0, 7.0], [0.3, "4.5", 8.0]]
+    rows = [["t", "speed", "accel"], [0.0, 1.0, 5.0], [0.1, None, "fast"], [None, 3.0, 7.0], [0.3, "4.5", 8.0]]
     recording = open_here(xlsx(tmp_path / "drive.xlsx", {"a": rows}))
-    assert recording.names == ("speed", "speed (2)")
+    assert recording.names == ("speed", "accel")
     channels = recording.read(recording.names)
     assert channels["speed"].time.tolist() == [0.0, 0.1, 0.3]
     assert np.array_equal(channels["speed"].values, [1.0, np.nan, 4.5], equal_nan=True)
-    assert np.array_equal(channels["speed (2)"].values, [5.0, np.nan, 8.0], equal_nan=True)
+    assert np.array_equal(channels["accel"].values, [5.0, np.nan, 8.0], equal_nan=True)
     assert recording.remarks == (
         "1 cells hold a text where a number is expected; they are NaN",
         "1 rows without a time are left out",
     )
+
+
+def test_columns_that_share_a_name_are_left_out(tmp_path: Path) -> None:
+    rows = [["t", "x", "speed", "speed"], [0.0, 1.0, 5.0, 6.0], [0.1, 2.0, 7.0, 8.0]]
+    recording = open_here(xlsx(tmp_path / "drive.xlsx", {"a": rows}))
+    assert recording.names == ("x",)
+    assert recording.remarks == ("columns that share a name are left out: speed",)
 
 
 def test_dates_are_seconds(tmp_path: Path) -> None:
@@ -118,16 +121,19 @@ def test_dates_are_seconds(tmp_path: Path) -> None:
     begin = (start - dt.datetime(1970, 1, 1)).total_seconds()
     # a workbook counts days; milliseconds is what the reader of dates keeps of them
     assert np.abs(time - begin - 0.5 * np.arange(4)).max() <= 1e-3
-    spans = table([["time", "x"], [dt.timedelta(seconds=1.5), 1], [dt.time(0, 0, 2), 2], [dt.date(1970, 1, 2), 3]])
-    assert spans.numbers[:, 0].tolist() == [1.5, 2.0, 86_400.0]
+    for cells, seconds in (
+        ([dt.timedelta(seconds=1.5), 2.5], [1.5, 2.5]),
+        ([dt.time(0, 0, 2), dt.time(0, 0, 3, 500_000)], [2.0, 3.5]),
+        ([dt.date(1970, 1, 2), dt.datetime(1970, 1, 2, 0, 0, 1)], [86_400.0, 86_401.0]),
+    ):
+        found = sheet_table([["time", "x"], *([cell, 1] for cell in cells)], "drive.xlsx")
+        assert found is not None
+        assert found[1]["time"].values.tolist() == seconds
 
 
-def test_what_is_no_table() -> None:
-    assert table([]) is None
-    assert table([["time", "speed"]]) is None
-    assert table([["time"], [1.0]]) is None
-    assert table([["time", "speed"], ["a", "b"], ["c", "d"], [1.0, 2.0]]).units == {"a": "c", "b": "d"}
-    assert table([[1.0, 2.0], [3.0, 4.0]]) is None
+@pytest.mark.parametrize("rows", [[], [["time", "speed"]], [["time", "speed"], ["a", "b"]], [[1.0, 2.0], [3.0, 4.0]]])
+def test_what_is_no_table(rows: Rows) -> None:
+    assert sheet_table(rows, "drive.xlsx") is None
 
 
 def test_a_sheet_without_names_or_without_a_time(tmp_path: Path) -> None:
@@ -148,7 +154,7 @@ def patched(path: Path, part: str, change: Callable[[bytes], bytes]) -> None:
 def test_more_cells_than_a_reader_takes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("avtorch.io.formats.listed.MOST_CELLS", 5)
     with pytest.raises(InputError, match="needs 5 at most"):
-        table([["time", "speed"], [1.0, 2.0], [1.0, 2.0], [1.0, 2.0]])
+        sheet_table([["time", "speed"], [1.0, 2.0], [1.0, 2.0], [1.0, 2.0]], "drive.xlsx")
 
 
 @pytest.mark.parametrize("form", WRITERS)

@@ -13,7 +13,7 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.io.formats import is_recording, kinds, open_recording
-from avtorch.io.formats.presets import PRESETS
+from avtorch.io.formats.presets import AUTOWARE, CARLA, OPENPILOT, PRESETS
 from avtorch.io.mapping import SIGNALS
 
 from .survival import refused
@@ -110,11 +110,6 @@ def test_only_regular_files_and_bags_folders_are_opened(tmp_path: Path) -> None:
     assert not is_recording(tmp_path / (300 * "x" + ".mf4"))
 
 
-def test_databases_are_for_can_logs(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="dbc is for CAN logs"):
-        open_recording(put(tmp_path, *BEGINNINGS["MCAP"]), dbc=["drive.dbc"])
-
-
 @pytest.mark.parametrize("case", LIBRARIES)
 def test_a_missing_library_is_one_command_away(tmp_path: Path, case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is loaded to see it, and no process is started."""
@@ -148,7 +143,7 @@ def test_looking_at_a_file_loads_no_library(tmp_path: Path) -> None:
 def test_layouts_speak_of_signals_and_units_that_logs_know() -> None:
     from avtorch.io.units import to_si
 
-    for preset in PRESETS.values():
+    for preset in PRESETS:
         assert set(preset.signals) <= {*SIGNALS, "throttle", "brake"}
         for signal, sources in preset.signals.items():
             for source in sources:
@@ -158,9 +153,8 @@ def test_layouts_speak_of_signals_and_units_that_logs_know() -> None:
 
 def test_a_layout_is_found_among_channels() -> None:
     names = ["/control/command/control_cmd/longitudinal/acceleration", "/vehicle/status/control_mode/mode", "/x"]
-    found = PRESETS["autoware"].find(names)
+    found = AUTOWARE.find(names)
     assert {signal: channel for signal, (channel, _) in found.items()} == {"accel_cmd": names[0], "engaged": names[1]}
     assert found["engaged"][1].when == (1, 3)
-    assert PRESETS["openacc"].find(["Time", "SpeedDoppler3"])["speed"][0] == "SpeedDoppler3"
-    assert PRESETS["carla"].find(["/carla/ego_vehicle/vehicle_status/velocity"])["speed"][1].unit == "m/s"
-    assert PRESETS["openpilot"].find(names) == {}
+    assert CARLA.find(["/carla/ego_vehicle/vehicle_status/velocity"])["speed"][1].unit == "m/s"
+    assert OPENPILOT.find(names) == {}
