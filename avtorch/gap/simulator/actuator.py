@@ -11,13 +11,15 @@ first and second order by scans, the rate limit row by row.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
-from avtorch.gap.simulator.nonlinear_recursion import solve
-from avtorch.gap.simulator.rate_limited import by_rows
+from avtorch.arrays import FloatArray
 from avtorch.gap.simulator.recursion import scan, scan_pair
 from avtorch.vehicle.glvd import motion_coefficients
 
@@ -91,16 +93,8 @@ class Actuator:
         if jerk is None:
             return _first_over(accel0, parts)
 
-        def step(before: Tensor, rows: slice) -> tuple[Tensor, Tensor]:
-            slope = torch.ones_like(before)
-            for part in parts:
-                before, own = _limited(before, part.rows(rows), jerk)[:2]
-                slope = slope * own
-            return before, slope
-
-        # row by row without derivatives; one Newton iteration then supplies them
         rows = by_rows(accel0, parts, jerk)
-        a = _joined(accel0, rows if torch.is_inference_mode_enabled() else solve(step, accel0, rows))
+        a = _joined(accel0, _linearised(lambda a, part: _limited(a, part, jerk)[:2], parts, accel0, rows))
         at, gained = a[..., :-1], torch.zeros_like(a[..., 1:])
         for part in parts:
             at, _, speed = _limited(at, part, jerk)
@@ -224,20 +218,67 @@ def _slewed(r: Tensor, part: Substep, jerk: Limits) -> tuple[Tensor, Tensor, Ten
 
 
 def _slewed_over(accel0: Tensor, parts: list[Substep], jerk: Limits) -> list[Substep]:
-    def step(before: Tensor, rows: slice) -> tuple[Tensor, Tensor]:
-        slope = torch.ones_like(before)
-        for part in parts:
-            before, own, _ = _slewed(before, part.rows(rows), jerk)
-            slope = slope * own
-        return before, slope
-
     rows = by_rows(accel0, parts, jerk, slews=True)
-    ends = _joined(accel0, rows if torch.is_inference_mode_enabled() else solve(step, accel0, rows))
+    ends = _joined(accel0, _linearised(lambda r, part: _slewed(r, part, jerk)[:2], parts, accel0, rows))
     at, out = ends[..., :-1], []
     for part in parts:
         at, _, mean = _slewed(at, part, jerk)
         out.append(Substep(mean, part.lag, part.length))
     return out
+
+
+def by_rows(start: Tensor, parts: Sequence[Substep], jerk: Limits, *, slews: bool = False) -> Tensor:
+    """States (..., time) after each row, from `start` (...), without derivatives: a first-order lag which `jerk`
+    limits; or with `slews` a target that moves to the given one no faster."""
+    each = [[x.detach() for x in (p.target, p.lag, p.length)] for p in parts]
+    limits = [x.detach().clamp_max(_NO_LIMIT) for x in jerk]
+    of_limits = [(*x.shape[:-1], 1) for x in limits]
+    shape = np.broadcast_shapes((*start.shape, 1), *of_limits, *(x.shape for p in each for x in p))
+
+    def columns(x: Tensor, time: int) -> FloatArray:
+        return x.expand(*shape[:-1], time).reshape(-1, time).numpy()
+
+    rows = np.stack([[columns(x, shape[-1]) for x in p] for p in each])
+    first = columns(start.detach()[..., None], 1)[:, 0]
+    most = np.stack([columns(x, 1)[:, 0] for x in limits])
+    return torch.from_numpy(_limited_rows(first, rows, most, slews)).reshape(shape)
+
+
+@njit(cache=True, error_model="numpy")
+def _limited_rows(
+    start: FloatArray, parts: FloatArray, limit: FloatArray, slews: bool
+) -> FloatArray:  # pragma: no cover - compiled
+    """(column, time) of `parts` (part, 3, column, time): targets, lags and lengths."""
+    _, _, columns, rows = parts.shape
+    out = np.empty((columns, rows))
+    for c in range(columns):
+        state, rise, fall = start[c], limit[0, c], limit[1, c]
+        for k in range(rows):
+            for p in range(parts.shape[0]):
+                g, T, h = parts[p, 0, c, k], parts[p, 1, c, k], parts[p, 2, c, k]
+                d = g - state
+                J = rise if d > 0 else fall
+                if slews:
+                    state += min(max(d, -J * h), J * h)
+                else:  # at the limit while it binds, then exponential
+                    at_limit = min(max(abs(d) / J - T, 0.0), h)
+                    left = d - np.copysign(J * at_limit, d)
+                    state = g - left * np.exp((at_limit - h) / T)
+            out[c, k] = state
+    return out
+
+
+def _linearised(
+    step: Callable[[Tensor, Substep], tuple[Tensor, Tensor]], parts: Sequence[Substep], start: Tensor, rows: Tensor
+) -> Tensor:
+    """`rows` (..., time) again, as a linear recursion by the slopes of `step(before, part) -> (after, slope)` at each:
+    first derivatives flow to `start` and to what `step` depends on."""
+    before = after = torch.cat([start.detach().expand(rows.shape[:-1])[..., None], rows[..., :-1]], -1)
+    slope = torch.ones_like(before)
+    for part in parts:
+        after, own = step(after, part)
+        slope = slope * own.detach()
+    return scan(slope, after - slope * before, start)
 
 
 def modes_over(tau: Tensor, T: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -13,7 +13,7 @@ from avtorch.cli.app import main
 from avtorch.cli.simulators import read_simulator
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, Effect, GapPlant, plant
-from avtorch.gap.simulator.domain import Domain
+from avtorch.gap.simulator.parameter import Domain
 
 WRONG = {
     "infinite": ("dead_time=inf", "dead_time.delay_s is inf, needs a positive number (5e-08 to 500 s), or 0"),
