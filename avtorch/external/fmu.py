@@ -173,9 +173,7 @@ class FmuSimulator:
         (begun,) = self._process.ask(request, OPENING_S)
         self._drive = self._process.drive = object()
         self._step, self._time = None, 0.0
-        self._start_notes = _start_notes(
-            zip(("accel", "speed"), begun["shown"], shown, (accel, speed), strict=True)
-        )
+        self._start_notes = _start_notes(zip(("accel", "speed"), begun["shown"], shown, (accel, speed), strict=True))
 
     def step(self, accel_cmd: float, dt: float) -> tuple[float, float]:
         """Hold the command [m/s²] for `dt` [s]; the acceleration [m/s²] and speed [m/s] at the end of it.

@@ -31,6 +31,7 @@ class RunningFmu:
 
     def __init__(self, path: str, folder: str) -> None:
         self._said, self._folder = "", folder
+        self._described: Any
         try:
             import fmpy
 
@@ -75,7 +76,7 @@ class RunningFmu:
 
     def begin(self, values: list[tuple[int, str, float]], command: Port, at: float, outputs: list[Port]) -> list[float]:
         """Begin a drive with these start values and the command at `at`; what the outputs then show."""
-        two = self._described.fmiVersion.startswith("2")
+        two = str(self._described.fmiVersion).startswith("2")
         self._said = ""
         if not self._fresh:
             (self._fmu.fmi2FreeInstance if two else self._fmu.fmi3FreeInstance)(self._fmu.component)
@@ -124,7 +125,7 @@ class RunningFmu:
         return reason(fault) + (f": {printable(self._said, 200)}" if self._said else "")
 
 
-def _variable(v: Any, units: dict[str, Any]) -> dict[str, Any]:
+def _variable(v: Any, units: dict[Any, Any]) -> dict[str, Any]:
     unit = v.unit or (v.declaredType.unit if v.declaredType is not None else None)
     base = units.get(unit or "")
     powers = {name: getattr(base, name) for name in ("kg", "m", "s", "A", "K", "mol", "cd", "rad")} if base else None

@@ -15,7 +15,7 @@ import pytest
 
 from avtorch import InputError
 from avtorch.external import FmuSimulator, Simulator, fmu
-from avtorch.external.external_simulator import side_by_side
+from avtorch.external.driving import side_by_side
 from avtorch.io.mapping import read_mapping
 from tests.external import fmus
 

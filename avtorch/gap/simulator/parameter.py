@@ -22,7 +22,6 @@ from avtorch.errors import InputError, printable
 Constraint = Literal["real", "positive", "negative", "unit", "interval"]
 
 _CENTRAL_80 = 1.2815515655446004  # normal quantile of 0.9
-_LOG_2PI = math.log(2 * math.pi)
 _AS_FAR = 3.0  # multiple of the typical range, where an effect does not state what is possible
 
 # typical ranges come from experience: no car exceeds them a thousandfold, nor does a fit fall a million times below
@@ -122,10 +121,6 @@ class Parameter:
         """`z` for a value, elementwise; infinite for a neutral value at the edge of the constraint."""
         return (self._link(value) - self.location) / self.spread
 
-    def log_prob(self, z: Tensor) -> Tensor:
-        """Log density of `z` under the prior, elementwise: the standard normal's."""
-        return -0.5 * z.square() - 0.5 * _LOG_2PI
-
     def typical(self) -> Tensor:
         """The prior's median."""
         shape = () if self.size == 1 else (self.size,)
@@ -201,10 +196,11 @@ class Domain:
         """`given` as a float, an int or a tuple. Raises an `InputError` that begins with `where`."""
         if not self.most:
             return self._number(where, given)
-        if not isinstance(given, list) or not self.least <= len(given) <= self.most:
-            what = f"a list of {len(given)} values" if isinstance(given, list) else _found(given)
+        count = len(cast("list[Any]", given)) if isinstance(given, list) else None
+        if count is None or not self.least <= count <= self.most:
+            what = _found(given) if count is None else f"a list of {count} values"
             raise InputError(f"{where}: found {what}, needs a list of {self.least} to {self.most} numbers")
-        values = tuple(self._number(f"{where}[{i}]", x) for i, x in enumerate(given))
+        values = tuple(self._number(f"{where}[{i}]", x) for i, x in enumerate(cast("list[Any]", given)))
         if self.rising and any(b <= a for a, b in pairwise(values)):
             raise InputError(f"{where}: found {_found(given)}, needs numbers that rise")
         return values

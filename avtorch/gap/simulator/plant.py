@@ -323,7 +323,7 @@ def _number(name: str, value: Any) -> str:
 
 
 def _of(tables: Mapping[str, Any], more: Iterable[type[Effect]]) -> GapPlant:
-    baseline: dict[str, float] = {}
+    baseline: dict[str, Any] = {}
     effects = []
     more = (*FREE_FORMS, *more)
     for name, value in tables.items():
@@ -335,8 +335,6 @@ def _of(tables: Mapping[str, Any], more: Iterable[type[Effect]]) -> GapPlant:
         domains = cls.domains()
         # an unknown name is passed on: the effect rejects it and lists the known ones
         given = {key: domains[key].value(f"{name}.{key}", x) if key in domains else x for key, x in table.items()}
-        if "profile" in given:
-            given["profile"] = tensor(given["profile"])
         effects.append(cls.of(given))
     return plant(effects, **baseline)
 
