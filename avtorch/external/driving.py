@@ -20,12 +20,13 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import numpy as np
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError, quoted
+from avtorch.external.fmu import FmuSimulator
 from avtorch.external.simulator import Simulator, WholeDrives
 from avtorch.io import Log
 
@@ -68,7 +69,6 @@ def driven_along(
     *,
     name: str = "simulator",
     step_s: float | None = None,
-    limit_s: float = LIMIT_S,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Log:
     """What `simulator` does under the commands of `log`, in its rows; each of its drives is a segment.
@@ -76,7 +76,7 @@ def driven_along(
     `step_s`: the simulator's own step [s], for one that takes no other; default: from row to row. A row in which the
     car is under the driver keeps the car's readings; one in which either stands is not `engaged`.
 
-    Raises `InputError` for a log without `accel_cmd`, and where the simulator raises, hangs for `limit_s`, or returns
+    Raises `InputError` for a log without `accel_cmd`, and where the simulator raises, hangs for 30 s, or returns
     what is no pair of finite numbers, with the time in the log.
     """
     if log.accel_cmd is None:
@@ -86,7 +86,7 @@ def driven_along(
     accel = np.zeros(log.rows) if log.accel is None else log.accel.copy()
     speed = np.zeros(log.rows) if log.speed is None else log.speed.copy()
     parts = drives_of(log)
-    with _limited(limit_s) as again:
+    with _limited(LIMIT_S) as again:
         drive = _Drive(simulator, name, step_s, again)
         for number, part in enumerate(parts):
             if progress is not None:
@@ -270,15 +270,6 @@ _copied: tuple[Simulator, Callable[[Simulator, Values], Any]] | None = None
 """What a copy of this process drives."""
 
 
-@runtime_checkable
-class Apart(Protocol):
-    """A simulator that runs in a process of its own and can be had in another; an `FmuSimulator` is one."""
-
-    def apart(self) -> Simulator: ...
-
-    def close(self) -> None: ...
-
-
 def side_by_side(
     simulator: Simulator, call: Callable[[Simulator, Values], Answer], each: Sequence[Values], processes: int
 ) -> list[Answer]:
@@ -288,7 +279,7 @@ def side_by_side(
     Raises what a call raises.
     """
     count = min(processes, len(each))
-    if isinstance(simulator, Apart) and count > 1:
+    if isinstance(simulator, FmuSimulator) and count > 1:
         others = [simulator.apart() for _ in range(count)]
         shares = [each[n::count] for n in range(count)]
         try:
@@ -296,7 +287,7 @@ def side_by_side(
                 found = list(pool.map(lambda own, share: [call(own, values) for values in share], others, shares))
         finally:
             for own in others:
-                own.close()  # type: ignore[attr-defined]
+                own.close()
         return [found[k % count][k // count] for k in range(len(each))]
     if count < 2 or "fork" not in multiprocessing.get_all_start_methods():
         return [call(simulator, values) for values in each]

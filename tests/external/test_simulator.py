@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from avtorch import ExternalSimulator, GLVDPlant, InputError, diagnose
-from avtorch.external import check_simulator, load_simulator, wrap
+from avtorch.external import check_simulator, driving, load_simulator, wrap
 from avtorch.external.driving import driven_along, drives_of
 from avtorch.external.external_simulator import discrepancy
 from avtorch.external.surrogate import surrogate_of
@@ -116,7 +116,9 @@ FAULTS: list[tuple[Callable[..., Any], str]] = [
 
 
 @pytest.mark.parametrize(("fault", "told"), FAULTS, ids=lambda x: "" if isinstance(x, str) else None)
-def test_faults_are_told_with_their_time(fault: Callable[..., Any], told: str) -> None:
+def test_faults_are_told_with_their_time(fault: Callable[..., Any], told: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(driving, "LIMIT_S", 0.2)
+
     class Faulty(OdeCar):
         count = 0
 
@@ -125,7 +127,7 @@ def test_faults_are_told_with_their_time(fault: Callable[..., Any], told: str) -
             return fault(accel_cmd, dt) if self.count > 10 else super().step(accel_cmd, dt)
 
     with pytest.raises(InputError, match=told):
-        driven_along(Faulty(), lap(), name="mine", limit_s=0.2)
+        driven_along(Faulty(), lap(), name="mine")
 
 
 @pytest.mark.parametrize(

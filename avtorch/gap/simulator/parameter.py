@@ -170,7 +170,6 @@ class Domain:
     high: float
     unit: str = ""
     neutral: float | None = None
-    kind: str = ""
     whole: bool = False
     least: int = 1
     most: int = 0
@@ -189,8 +188,7 @@ class Domain:
             "unit": (0.0, 1.0),
             "real": (-_FAR * max(abs(low), abs(high)), _FAR * max(abs(low), abs(high))),
         }[kind]
-        signed = kind if kind in ("positive", "negative") else ""
-        return cls(parameter.name, *ends, unit, parameter.neutral, signed)
+        return cls(parameter.name, *ends, unit, parameter.neutral)
 
     def value(self, where: str, given: Any) -> Any:
         """`given` as a float, an int or a tuple. Raises an `InputError` that begins with `where`."""
@@ -215,7 +213,7 @@ class Domain:
         if value == self.neutral:
             return value
         if not self.low <= value <= self.high or (self.whole and value != int(value)):
-            noun = f"a {self.kind} number" if self.kind else "a whole number" if self.whole else "a number"
+            noun = "a whole number" if self.whole else "a number"
             also = "" if self.neutral is None else f", or {self.neutral:g}"
             unit = f" {self.unit}" if self.unit else ""
             raise InputError(f"{where} is {value:g}, needs {noun} ({self.low:g} to {self.high:g}{unit}){also}")
@@ -223,9 +221,4 @@ class Domain:
 
 
 def _found(given: Any) -> str:
-    """A value as shown in a message: TOML's own words for booleans, the type for anything that is no single value."""
-    if isinstance(given, bool):
-        return str(given).lower()
-    if isinstance(given, list | dict):
-        return "a list" if isinstance(given, list) else "a table"
     return printable(repr(given), 40)

@@ -47,8 +47,8 @@ Example:
 
 
 _DOMAINS = {
-    "T_L": Domain("T_L", 1e-4, 1e3, "s", kind="positive"),
-    "K_L": Domain("K_L", 1e-4, 1e3, neutral=0.0, kind="positive"),
+    "T_L": Domain("T_L", 1e-4, 1e3, "s"),
+    "K_L": Domain("K_L", 1e-4, 1e3, neutral=0.0),
     "sigma": Domain("sigma", 0.0, 1e3, "m/s³"),
 }
 """Valid values of the baseline's parameters in a text."""
