@@ -87,19 +87,54 @@ class Actuator:
         """
         steps = parts[0].target.shape[-1] - 1
         parts = [part.rows(slice(0, steps)) for part in parts]
+        rows = self._rows(accel0, parts)
+        before = ActuatorState(*(None if x is None else x[..., :-1] for x in vars(rows).values()))
+        return rows.accel, self.step(before, parts)[1]
+
+    def _rows(self, accel0: Tensor, parts: list[Substep]) -> ActuatorState:
+        """The states (..., time) of all rows."""
         if self.tau is not None:
-            return self._second_over(accel0, parts)
+            return self._second_rows(accel0, parts)
         jerk = self.limits
         if jerk is None:
-            return _first_over(accel0, parts)
-
+            alpha, beta = torch.ones(1, dtype=accel0.dtype), torch.zeros(())
+            for part in parts:
+                ratio = part.length / part.lag
+                keep = torch.exp(-ratio)
+                alpha, beta = alpha * keep, keep * beta - torch.expm1(-ratio) * part.target
+            return ActuatorState(_joined(accel0, scan(alpha, beta, accel0)))
         rows = by_rows(accel0, parts, jerk)
-        a = _joined(accel0, _linearised(lambda a, part: _limited(a, part, jerk)[:2], parts, accel0, rows))
-        at, gained = a[..., :-1], torch.zeros_like(a[..., 1:])
+        later = _linearised(lambda a, part: _limited(a, part, jerk)[:2], parts, accel0, rows)
+        return ActuatorState(_joined(accel0, later))
+
+    def _second_rows(self, accel0: Tensor, parts: list[Substep]) -> ActuatorState:
+        assert self.tau is not None
+        target, jerk = None, self.limits
+        if jerk is not None:
+            rows = by_rows(accel0, parts, jerk, slews=True)
+            target = _joined(accel0, _linearised(lambda r, part: _slewed(r, part, jerk)[:2], parts, accel0, rows))
+            at, means = target[..., :-1], []
+            for part in parts:
+                at, _, mean = _slewed(at, part, jerk)
+                means.append(Substep(mean, part.lag, part.length))
+            parts = means
+        one, zero = torch.ones(1, dtype=accel0.dtype), torch.zeros(1, dtype=accel0.dtype)
+        m, b = (one, zero, zero, one), (zero, zero)
         for part in parts:
-            at, _, speed = _limited(at, part, jerk)
-            gained = gained + speed
-        return a, gained
+            n = modes_over(self.tau, part.lag, part.length)
+            b = (
+                n[0] * b[0] + n[1] * b[1] + (1 - n[0]) * part.target,
+                n[2] * b[0] + n[3] * b[1] - n[2] * part.target,
+            )
+            m = (
+                n[0] * m[0] + n[1] * m[2],
+                n[0] * m[1] + n[1] * m[3],
+                n[2] * m[0] + n[3] * m[2],
+                n[2] * m[1] + n[3] * m[3],
+            )
+        rest = torch.zeros_like(accel0)
+        a, swing = scan_pair(m, b, (accel0, rest))
+        return ActuatorState(_joined(accel0, a), _joined(rest, swing), target)
 
     def _part(self, state: ActuatorState, part: Substep) -> tuple[ActuatorState, Tensor, Tensor]:
         g, T, h = part.target, part.lag, part.length
@@ -124,55 +159,9 @@ class Actuator:
         place = place - (self.tau * self.tau * (accel - state.accel) - w * h)
         return ActuatorState(accel, swing, slewed), speed, place
 
-    def _second_over(self, accel0: Tensor, parts: list[Substep]) -> tuple[Tensor, Tensor]:
-        assert self.tau is not None
-        if self.limits is not None:
-            parts = _slewed_over(accel0, parts, self.limits)
-        maps = []
-        for part in parts:
-            m = modes_over(self.tau, part.lag, part.length)
-            maps.append((m, ((1 - m[0]) * part.target, -m[2] * part.target)))
-        (m, b), *more = maps
-        for n, c in more:
-            b = (n[0] * b[0] + n[1] * b[1] + c[0], n[2] * b[0] + n[3] * b[1] + c[1])
-            m = (
-                n[0] * m[0] + n[1] * m[2],
-                n[0] * m[1] + n[1] * m[3],
-                n[2] * m[0] + n[3] * m[2],
-                n[2] * m[1] + n[3] * m[3],
-            )
-        rest = torch.zeros_like(accel0)
-        a, w = scan_pair(m, b, (accel0, rest))
-        a, w = _joined(accel0, a), _joined(rest, w)
-        at, swing, gained = a[..., :-1], w[..., :-1], torch.zeros_like(a[..., 1:])
-        for part, (own, add) in zip(parts, maps, strict=True):
-            after = own[0] * at + own[1] * swing + add[0]
-            swung = own[2] * at + own[3] * swing + add[1]
-            gained = gained + part.target * part.length - part.lag * (after - at) - (swung - swing)
-            at, swing = after, swung
-        return a, gained
-
 
 def _joined(first: Tensor, later: Tensor) -> Tensor:
     return torch.cat([first.expand(later.shape[:-1])[..., None], later], -1)
-
-
-def _first_over(accel0: Tensor, parts: list[Substep]) -> tuple[Tensor, Tensor]:
-    alpha, beta = None, torch.zeros(())
-    for part in parts:
-        ratio = part.length / part.lag
-        keep, give = torch.exp(-ratio), -torch.expm1(-ratio)
-        alpha = keep if alpha is None else alpha * keep
-        beta = keep * beta + give * part.target
-    assert alpha is not None
-    a = _joined(accel0, scan(alpha if alpha.dim() else alpha[None], beta, accel0))
-    at, gained = a[..., :-1], torch.zeros_like(a[..., 1:])
-    for i, part in enumerate(parts):
-        last = i == len(parts) - 1
-        after = a[..., 1:] if last else at - torch.expm1(-part.length / part.lag) * (part.target - at)
-        gained = gained + part.target * part.length - part.lag * (after - at)
-        at = after
-    return a, gained
 
 
 def _limited(a: Tensor, part: Substep, jerk: Limits) -> tuple[Tensor, Tensor, Tensor]:
@@ -215,16 +204,6 @@ def _slewed(r: Tensor, part: Substep, jerk: Limits) -> tuple[Tensor, Tensor, Ten
     missed = moving * 0.5 * (d + part.target - after) + (h - moving) * (part.target - after)
     mean = part.target - torch.where(h > 0, missed / torch.where(h > 0, h, 1.0), 0.0)
     return after, (d.abs() > J * h).to(r.dtype), mean
-
-
-def _slewed_over(accel0: Tensor, parts: list[Substep], jerk: Limits) -> list[Substep]:
-    rows = by_rows(accel0, parts, jerk, slews=True)
-    ends = _joined(accel0, _linearised(lambda r, part: _slewed(r, part, jerk)[:2], parts, accel0, rows))
-    at, out = ends[..., :-1], []
-    for part in parts:
-        at, _, mean = _slewed(at, part, jerk)
-        out.append(Substep(mean, part.lag, part.length))
-    return out
 
 
 def by_rows(start: Tensor, parts: Sequence[Substep], jerk: Limits, *, slews: bool = False) -> Tensor:
