@@ -20,10 +20,10 @@ import numpy as np
 
 from avtorch.errors import InputError
 from avtorch.follower import FollowerDiagnosis, diagnose_follower
-from avtorch.gap.effects.road_grade import GRAVITY
 from avtorch.io import Log, read_following
 from avtorch.io.leaders import numbered
 from avtorch.io.tables import read_table
+from avtorch.io.units import GRAVITY
 
 LAP_M = 5757.9
 

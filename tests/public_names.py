@@ -20,7 +20,6 @@ PACKAGES = (
     "avtorch.io",
     "avtorch.pedals",
     "avtorch.gap",
-    "avtorch.gap.effects",
     "avtorch.external",
     "avtorch.follower",
     "avtorch.remedy",

@@ -23,7 +23,7 @@ SLOW = frozenset(
         "avtorch.external.compare_simulators.compare_simulators",
         "avtorch.external.external_simulator.ExternalSimulator",
         "avtorch.external.fmu.FmuSimulator",
-        "avtorch.external.identification.SimulatorCheck",
+        "avtorch.external.surrogate.SimulatorCheck",
         "avtorch.external.compare_simulators.SimulatorComparison",
         "avtorch.external.wrap.wrap",
         "avtorch.fleet.folder.read_rows",

@@ -14,7 +14,6 @@ needed at all is decided as it is for effects, by evidence, and at their price (
 
 from __future__ import annotations
 
-import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -237,7 +236,7 @@ class Adjusted:
 class Rollouts:
     """A simulator under the commands of the car's drives `logs`, by the values of its parameters; from `start` on.
 
-    `drive` makes the outputs of the drives, for several values at once; none is driven twice. `seconds` it has taken.
+    `drive` makes the outputs of the drives, for several values at once; none is driven twice.
     Raises `InputError` where more than `most` would be driven.
     """
 
@@ -245,7 +244,6 @@ class Rollouts:
     start: Values
     drive: Callable[[Sequence[Values]], Sequence[Sequence[Log]]]
     most: int
-    seconds: float = 0.0
     _found: dict[tuple[float, ...], tuple[Log, ...]] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -261,10 +259,8 @@ class Rollouts:
         if len(self._found) + len(new) > self.most:
             raise InputError(f"most_rollouts: found {self.most}, needs more for {listed(self.start)} to settle")
         if new:
-            begun = clock.monotonic()
             driven = self.drive(list(new.values()))
             self._found |= {key: tuple(outputs) for key, outputs in zip(new, driven, strict=True)}
-            self.seconds += clock.monotonic() - begun
         return [self._found[key] for key in keys]
 
 

@@ -40,7 +40,7 @@ from avtorch.external.simulator import DrivenPlant
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.compare import LEVEL
 from avtorch.gap.drive_record import FEWEST_BLOCKS, Record, blocks_of
-from avtorch.gap.quantity import Quantity, unit_of, words_of
+from avtorch.gap.quantity import Quantity, of_fields, unit_of, words_of
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.rollout_errors import HORIZON_S, block_squares, reached, rolled_out
 from avtorch.gap.simulator.effect import Effect
@@ -67,23 +67,6 @@ class ComparedSimulator:
     offset_s: tuple[float, ...]
     notes: tuple[str, ...] = ()
 
-    def to_dict(self) -> dict[str, Any]:
-        """As in `comparison.json`."""
-        chain = self.surrogate.plant
-        effects = {name: _scalars(values) for name, values in chain.report().items()}
-        return {
-            "name": self.name,
-            "source": self.source,
-            "offset_s": list(self.offset_s),
-            "surrogate": {
-                "effects": effects,
-                "T_L": float(chain.T_L),
-                "K_L": float(chain.K_L),
-                "left": dict(self.surrogate.left),
-            },
-            "notes": list(self.notes),
-        }
-
 
 @dataclass(frozen=True)
 class ErrorsOfTwo:
@@ -92,10 +75,6 @@ class ErrorsOfTwo:
     first: Quantity
     second: Quantity
     ratio: Quantity
-
-    def to_dict(self) -> dict[str, Any]:
-        """As in `comparison.json`."""
-        return {"first": self.first.to_dict(), "second": self.second.to_dict(), "ratio": self.ratio.to_dict()}
 
 
 @dataclass(frozen=True)
@@ -115,12 +94,6 @@ class Difference:
     def brings_nearer(self) -> bool:
         """Whether the error surely falls, at 95 %."""
         return self.ratio.q95 < 1
-
-    def to_dict(self) -> dict[str, Any]:
-        """As in `comparison.json`."""
-        sides = {"first": self.first, "second": self.second}
-        told = {side: None if values is None else dict(values) for side, values in sides.items()}
-        return {"name": self.name, "parts": list(self.parts), **told, "ratio": self.ratio.to_dict()}
 
     def __str__(self) -> str:
         if self.name == OTHERS:
@@ -195,25 +168,10 @@ class SimulatorComparison(Displayed):
 
     def to_dict(self) -> dict[str, Any]:
         """The object of `comparison.json` for two simulators, schema `avtorch.simulators/1`."""
-        return {
-            "schema": "avtorch.simulators/1",
-            "log": self.log.to_dict(),
-            "first": self.first.to_dict(),
-            "second": self.second.to_dict(),
-            "errors": {metric: e.to_dict() for metric, e in self.errors.items()},
-            "horizon_s": self.horizon_s,
-            "blocks": self.blocks,
-            "ratio": self.ratio.to_dict(),
-            "probability": {"first": self.p_first, "second": self.p_second},
-            "level": self.level,
-            "nearer": self.nearer,
-            "differences": [d.to_dict() for d in self.differences],
-            "why": self.why,
-        }
-
-
-def _scalars(values: Mapping[str, Any]) -> dict[str, float]:
-    return {key: float(x) for key, x in values.items() if x.dim() == 0}
+        out = of_fields(self)
+        probability = {"first": out.pop("p_first"), "second": out.pop("p_second")}
+        answer = {"probability": probability, "nearer": self.nearer, "why": self.why}
+        return {"schema": "avtorch.simulators/1", **out, **answer}
 
 
 def _told_values(values: Mapping[str, float]) -> str:

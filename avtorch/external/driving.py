@@ -11,18 +11,22 @@ smooth, so between its rows it is interpolated; the car's readings stay as they 
 from __future__ import annotations
 
 import math
+import multiprocessing
 import signal
 import threading
-import time as clock
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
+from typing import Any, TypeVar
 
 import numpy as np
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError, quoted
+from avtorch.external.fmu import FmuSimulator
 from avtorch.external.simulator import Simulator, WholeDrives
 from avtorch.io import Log
 
@@ -56,8 +60,6 @@ def in_drives(simulated: Log, log: Log) -> Log:
 LIMIT_S = 30.0
 """Longest that a simulator may take for one step or one reset [s]."""
 _JUMP_MPS2 = 20.0  # no car accelerates like that
-_TRIED_ROWS = 200  # by which the time for all is foreseen
-_WORTH_SAYING_S = 3.0
 _AVERAGED_S = 0.3  # over which the car's acceleration at the beginning of a drive is averaged
 
 
@@ -67,7 +69,6 @@ def driven_along(
     *,
     name: str = "simulator",
     step_s: float | None = None,
-    limit_s: float = LIMIT_S,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Log:
     """What `simulator` does under the commands of `log`, in its rows; each of its drives is a segment.
@@ -75,7 +76,7 @@ def driven_along(
     `step_s`: the simulator's own step [s], for one that takes no other; default: from row to row. A row in which the
     car is under the driver keeps the car's readings; one in which either stands is not `engaged`.
 
-    Raises `InputError` for a log without `accel_cmd`, and where the simulator raises, hangs for `limit_s`, or returns
+    Raises `InputError` for a log without `accel_cmd`, and where the simulator raises, hangs for 30 s, or returns
     what is no pair of finite numbers, with the time in the log.
     """
     if log.accel_cmd is None:
@@ -85,26 +86,13 @@ def driven_along(
     accel = np.zeros(log.rows) if log.accel is None else log.accel.copy()
     speed = np.zeros(log.rows) if log.speed is None else log.speed.copy()
     parts = drives_of(log)
-    with _limited(limit_s) as again:
+    with _limited(LIMIT_S) as again:
         drive = _Drive(simulator, name, step_s, again)
-        what = "driving the simulator" if progress is None else f"driving the simulator{_foreseen(drive, log, parts)}"
         for number, part in enumerate(parts):
             if progress is not None:
-                progress(what, number, len(parts))
+                progress("driving the simulator", number, len(parts))
             accel[part], speed[part] = drive.along(log, part)
     return in_drives(replace(log, name=name, accel=accel, speed=speed), log)
-
-
-def _foreseen(drive: _Drive, log: Log, parts: Sequence[slice]) -> str:
-    """How long it will take, by its first rows; nothing where that is short."""
-    rows = sum(part.stop - part.start for part in parts)
-    if rows < 10 * _TRIED_ROWS:
-        return ""
-    first = max(parts, key=lambda part: part.stop - part.start)
-    begun = clock.monotonic()
-    drive.along(log, slice(first.start, min(first.stop, first.start + _TRIED_ROWS)))
-    seconds = (clock.monotonic() - begun) * rows / _TRIED_ROWS
-    return f", about {seconds:.0f} s" if seconds > _WORTH_SAYING_S else ""
 
 
 class _Drive:
@@ -195,16 +183,8 @@ _GRID_S = 0.005
 _SAME = 0.05  # of the command's standard deviation, by which two commands may differ (root mean square)
 
 
-@dataclass(frozen=True)
-class Aligned:
-    """`log`: the simulator's output in the car's rows; `offset_s`: what its clock was ahead of the car's [s]."""
-
-    log: Log
-    offset_s: float
-
-
-def aligned(simulated: Log, log: Log) -> Aligned:
-    """The output `simulated` in the rows of the car's `log`.
+def aligned(simulated: Log, log: Log) -> tuple[Log, float]:
+    """The output `simulated` in the rows of the car's `log`, and what its clock was ahead of the car's [s].
 
     Where both have commands, the clocks are shifted until these agree; where the output has none, both are taken to
     begin at the same moment, unless their clocks overlap. Rows of the car that the output does not cover are marked as
@@ -229,7 +209,7 @@ def aligned(simulated: Log, log: Log) -> Aligned:
     if simulated.accel_cmd is not None and log.accel_cmd is not None:
         _check_commands(simulated, log, time, inside & log.engaged)
     whole = replace(log, name=simulated.name, engaged=log.engaged & inside, **channels)
-    return Aligned(whole, shift + simulated.epoch_s - log.epoch_s)
+    return whole, shift + simulated.epoch_s - log.epoch_s
 
 
 def _shift(simulated: Log, log: Log) -> float:
@@ -242,9 +222,9 @@ def _shift(simulated: Log, log: Log) -> float:
     from scipy.signal import correlate, correlation_lags
 
     grid = np.arange(-_FARTHEST_S, log.elapsed[-1] + _FARTHEST_S, _GRID_S)
-    one = _standard(_held(log.elapsed, log.accel_cmd, grid))
-    other = _standard(_held(simulated.elapsed - begun, simulated.accel_cmd, grid))
-    shared = correlate(other, one, mode="full", method="fft")
+    one = _held(log.elapsed, log.accel_cmd, grid)
+    other = _held(simulated.elapsed - begun, simulated.accel_cmd, grid)
+    shared = correlate(other - other.mean(), one - one.mean(), mode="full", method="fft")
     lags = correlation_lags(len(other), len(one))
     near = np.abs(lags) <= _FARTHEST_S / _GRID_S
     best = int(lags[near][np.argmax(shared[near])])
@@ -257,10 +237,6 @@ def _held(time: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArray:
     """`values` held from row to row, zero outside."""
     row = np.searchsorted(time, grid + 1e-9, side="right") - 1
     return np.where((row >= 0) & (grid <= time[-1]), values[np.maximum(row, 0)], 0.0)
-
-
-def _standard(x: FloatArray) -> FloatArray:
-    return x - x.mean()
 
 
 def _covered(simulated: Log, time: FloatArray) -> BoolArray:
@@ -286,3 +262,50 @@ def _check_commands(simulated: Log, log: Log, time: FloatArray, rows: BoolArray)
             f"(root mean square, commands have a standard deviation of {size:.2g}); needs the simulator driven by the "
             "car's own commands, in an open loop"
         )
+
+
+Answer = TypeVar("Answer")
+Values = Mapping[str, float]
+_copied: tuple[Simulator, Callable[[Simulator, Values], Any]] | None = None
+"""What a copy of this process drives."""
+
+
+def side_by_side(
+    simulator: Simulator, call: Callable[[Simulator, Values], Answer], each: Sequence[Values], processes: int
+) -> list[Answer]:
+    """`call(simulator, values)` for each of the values, in order, at most `processes` at once: an FMU in more processes
+    of its own, an object in copies of this one, or one after another where the system cannot copy a process (Windows).
+
+    Raises what a call raises.
+    """
+    count = min(processes, len(each))
+    if isinstance(simulator, FmuSimulator) and count > 1:
+        others = [simulator.apart() for _ in range(count)]
+        shares = [each[n::count] for n in range(count)]
+        try:
+            with ThreadPoolExecutor(count) as pool:
+                found = list(pool.map(lambda own, share: [call(own, values) for values in share], others, shares))
+        finally:
+            for own in others:
+                own.close()
+        return [found[k % count][k // count] for k in range(len(each))]
+    if count < 2 or "fork" not in multiprocessing.get_all_start_methods():
+        return [call(simulator, values) for values in each]
+    # a copy of the process has the simulator, which need not be one that can be sent
+    copies = multiprocessing.get_context("fork")
+    try:
+        with ProcessPoolExecutor(count, copies, _take_over, (simulator, call)) as pool:
+            return list(pool.map(_called, each))
+    except BrokenProcessPool:
+        raise InputError("simulator: ended the process that drove it") from None
+
+
+def _take_over(simulator: Simulator, call: Callable[[Simulator, Values], Any]) -> None:
+    global _copied
+    _copied = simulator, call
+
+
+def _called(values: Values) -> Any:
+    assert _copied is not None
+    simulator, call = _copied
+    return call(simulator, values)

@@ -1,31 +1,41 @@
-"""A simulator of the user's as the baseline of a diagnosis: by its output, or driven along the car's commands."""
+"""A simulator of the user's as the baseline of a diagnosis: by its output, or driven along the car's commands.
+
+Let S be the simulator, M its surrogate, and y what the car did under the same commands. The simulator predicts y as
+
+    S(u) = M(u) + d,   d = S(u) - M(u),
+
+so the gap between car and simulator is that between `y - d` and the chain M. A diagnosis with M as its baseline, of a
+log from which `d` is subtracted, is a diagnosis of the simulator; `d` is known row by row and needs no model. Effects
+and parameters are then asked of M: exact where they act on the output (sensors, forces), where they commute with the
+rest of the simulator (a delay), or where M holds what they do not commute with; else to first order in `d`, which is
+small where the surrogate is good.
+"""
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, cast
 
+import numpy as np
+from scipy.integrate import trapezoid
+
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
 from avtorch.external.adjusting import Adjusted, Rollouts, adjusted, fewest_rollouts
-from avtorch.external.answer import lag_and_gain, responses, rollout_errors, with_simulator, without_discrepancy
-from avtorch.external.driving import aligned, driven_along, in_drives
-from avtorch.external.simulator import Limits, Simulator, values_of, with_values
+from avtorch.external.driving import Values, aligned, driven_along, in_drives, side_by_side
+from avtorch.external.simulator import Limits, Simulator, check_methods, values_of, with_values
 from avtorch.external.surrogate import Surrogate, surrogate_of
+from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.simulator_under_test import SAME_KIND, ParameterDifference, SimulatorUnderTest
 from avtorch.gap.simulator.plant import GapPlant
+from avtorch.gap.simulator.simulator_input import SimulatorInput
 from avtorch.io import Log
 from avtorch.vehicle.plant import GLVDPlant
 
 Progress = Callable[[str, int, int], None]
-Values = Mapping[str, float]
-Answer = TypeVar("Answer")
 _MOST_PROCESSES = 64
-_copied: tuple[Simulator, Callable[[Simulator, Values], Any]] | None = None
-"""What a copy of this process drives."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +80,8 @@ class ExternalSimulator:
             found = (found,)
         elif isinstance(found, (list, tuple)) and found and all(isinstance(x, Log) for x in found):
             found = tuple(found)
-        elif not isinstance(found, Simulator):
-            own = found.__name__ if isinstance(found, type) else type(found).__name__
-            missing = " and ".join(n for n in ("reset", "step") if not callable(getattr(found, n, None)))
-            raise InputError(
-                f"simulator: {quoted(own)} has no {missing}; needs reset(speed, accel) and step(accel_cmd, dt)"
-            )
+        else:
+            check_methods(found, quoted(found.__name__ if isinstance(found, type) else type(found).__name__))
         default = found[0].name if isinstance(found, tuple) else type(found).__name__
         if not (isinstance(self.processes, int) and 1 <= self.processes <= _MOST_PROCESSES):
             raise InputError(f"processes: found {self.processes!r}, needs a number from 1 to {_MOST_PROCESSES}")
@@ -116,8 +122,8 @@ class ExternalSimulator:
             if len(self.output) != len(logs):
                 raise InputError(f"simulated: found {len(self.output)} logs for {len(logs)} drives, needs one for each")
             found = [aligned(other, log) for other, log in zip(self.output, logs, strict=True)]
-            driven = tuple(in_drives(x.log, log) for x, log in zip(found, logs, strict=True))
-            return driven, tuple(x.offset_s for x in found)
+            driven = tuple(in_drives(output, log) for (output, _), log in zip(found, logs, strict=True))
+            return driven, tuple(offset for _, offset in found)
         assert isinstance(self.of, Simulator)
         return self._driven(self.of, logs, progress), (0.0,) * len(logs)
 
@@ -133,13 +139,11 @@ class ExternalSimulator:
             return self._driven(with_values(own, values), logs)
 
         def drive(places: Sequence[Values]) -> list[tuple[Log, ...]]:
-            first = not len(rollouts)  # by which it is told how long the others take
-            if progress is not None and not first:
-                each = rollouts.seconds / len(rollouts)
-                many = f"{len(rollouts) + len(places)} of {self.most_rollouts} at most"
-                progress(f"fitting its parameters, drive {many}, {each:.2g} s each", len(rollouts), self.most_rollouts)
-            if first and len(places) == 1:
+            if not len(rollouts) and len(places) == 1:
                 return [self._driven(simulator, logs, progress)]
+            if progress is not None:
+                many = f"{len(rollouts) + len(places)} of {self.most_rollouts} at most"
+                progress(f"fitting its parameters, drive {many}", len(rollouts), self.most_rollouts)
             return side_by_side(simulator, one, places, self.processes)
 
         rollouts = Rollouts(logs, values_of(simulator, self.adjustable), drive, self.most_rollouts)
@@ -186,18 +190,37 @@ class SimulatorBesideCar:
         return again._told(found)
 
     def _told(self, found: Diagnosis) -> Diagnosis:
-        return with_simulator(
-            found,
-            self.surrogate,
-            name=self.simulator.name,
-            source="simulator" if self.simulator.output is None else "output",
-            offset_s=self.offsets,
-            rollout=self.rollout,
-            own_parameters=() if self.fitted is None else self.fitted.parameters,
-            lag_and_gain=lag_and_gain(self.logs, self.outputs, self.plant, found),
-            rollouts=0 if self.fitted is None else self.fitted.rollouts,
-            notes=tuple(getattr(self.simulator.of, "notes", ())),
+        chain, fitted = self.plant, self.fitted
+        own = chain.report()
+        differences = [
+            *(() if fitted is None else fitted.parameters),
+            *lag_and_gain(self.logs, self.outputs, chain, found),
+        ]
+        # what chance decides is in no rollout, and so in no simulator
+        by_chance = set() if found.budget is None else {part.name for part in found.budget.chance}
+        missing = [
+            effect
+            for effect in found.verdict.names
+            if effect not in ("none", "unknown") and effect not in by_chance and not _of_a_size(found, effect, chain)
+        ]
+        for effect in found.verdict.names:
+            for key, car in _parameters(found, effect).items() if effect in own else ():
+                if key in own[effect]:
+                    value = float(own[effect][key])
+                    wrong = effect not in missing and not car.q05 <= value <= car.q95
+                    differences.append(ParameterDifference(f"{effect}.{key}", value, car, wrong))
+        facts = SimulatorUnderTest(
+            self.simulator.name,
+            "simulator" if self.simulator.output is None else "output",
+            self.offsets,
+            chain,
+            self.surrogate.left,
+            self.rollout,
+            tuple(differences),
+            tuple(missing),
+            0 if fitted is None else fitted.rollouts,
         )
+        return replace(found, tested=facts, notes=(*found.notes, *getattr(self.simulator.of, "notes", ())))
 
 
 def _without(log: Log, drives: Log, car: GapPlant, bare: GapPlant) -> Log:
@@ -223,51 +246,144 @@ def _beside(
     return SimulatorBesideCar(simulator, surrogate, tuple(outputs), freed, offsets, errors, rollouts, fitted)
 
 
-@runtime_checkable
-class Apart(Protocol):
-    """A simulator that runs in a process of its own and can be had in another; an `FmuSimulator` is one."""
+def responses(drives: Log, plant: GapPlant) -> dict[str, FloatArray]:
+    """What `plant` does in `drives` by the channels that these have, (time,): acceleration [m/s²] and speed [m/s], anew
+    from each segment's first row. Rows under the driver keep what is there."""
+    found = {name: values.copy() for name in ("accel", "speed") if (values := getattr(drives, name)) is not None}
+    for segment in range(int(drives.segment[-1]) + 1):
+        rows = drives.segment == segment
+        if rows.sum() < 2 or not drives.engaged[rows].any():  # under the driver there is no simulator
+            continue
+        response = plant.response(SimulatorInput.from_log(drives, segment))
+        answers = {"accel": response.accel_measured, "speed": response.speed_measured}
+        for name, values in found.items():
+            values[rows] = answers[name].numpy()
+    return found
 
-    def apart(self) -> Simulator: ...
 
-    def close(self) -> None: ...
+def discrepancy(simulated: Log, surrogate: GapPlant) -> dict[str, FloatArray]:
+    """`d` by channel, (time,): acceleration [m/s²] and, from each segment's start, speed [m/s]."""
+    return {name: getattr(simulated, name) - values for name, values in responses(simulated, surrogate).items()}
 
 
-def side_by_side(
-    simulator: Simulator, call: Callable[[Simulator, Values], Answer], each: Sequence[Values], processes: int
-) -> list[Answer]:
-    """`call(simulator, values)` for each of the values, in order, at most `processes` at once: an FMU in more processes
-    of its own, an object in copies of this one, or one after another where the system cannot copy a process (Windows).
+def without_discrepancy(log: Log, simulated: Log, surrogate: GapPlant) -> Log:
+    """The car's `log` less what the simulator does beyond its surrogate, row by row.
 
-    Raises what a call raises.
+    Raises `InputError` where the simulator's output lacks a channel of the log.
     """
-    count = min(processes, len(each))
-    if isinstance(simulator, Apart) and count > 1:
-        others = [simulator.apart() for _ in range(count)]
-        shares = [each[n::count] for n in range(count)]
-        try:
-            with ThreadPoolExecutor(count) as pool:
-                found = list(pool.map(lambda own, share: [call(own, values) for values in share], others, shares))
-        finally:
-            for own in others:
-                own.close()  # type: ignore[attr-defined]
-        return [found[k % count][k // count] for k in range(len(each))]
-    if count < 2 or "fork" not in multiprocessing.get_all_start_methods():
-        return [call(simulator, values) for values in each]
-    # a copy of the process has the simulator, which need not be one that can be sent
-    copies = multiprocessing.get_context("fork")
+    known = discrepancy(simulated, surrogate)
+    channels = {name: getattr(log, name) for name in ("accel", "speed") if getattr(log, name) is not None}
+    shared = {name: values - known[name] for name, values in channels.items() if name in known}
+    if not shared:
+        raise InputError(f"{simulated.name}: found {' and '.join(known)}, needs {' or '.join(channels)} as {log.name}")
+    return replace(log, **{name: shared.get(name) for name in channels})
+
+
+_STEP_MPS2, _RATE_HZ = 0.5, 100
+_BEFORE_S, _AFTER_S, _SETTLED_S = 1.0, 9.0, 1.0
+
+
+def lateness(plant: GapPlant, speed: float) -> float:
+    """Mean delay [s] of the acceleration that answers a step in the command, at a speed [m/s].
+
+    It is the area between the step and its answer, over the answer's height: `T_L` for GLVD, and the sum of the delays
+    of all that the command passes. At least `T_L`, also for a plant that does not answer a step of 0.5 m/s².
+    """
+    time = np.arange(round((_BEFORE_S + _AFTER_S) * _RATE_HZ)) / _RATE_HZ
+    step = np.where(time < _BEFORE_S, 0.0, _STEP_MPS2)
+    still = 0.0 * time
+
+    def accel(command: FloatArray) -> FloatArray:
+        drive = Log.from_arrays(time=time, accel_cmd=command, accel=still, speed=still + max(speed, 1.0))
+        return responses(drive, plant)["accel"]
+
+    # without the forces that act whatever the command
+    answer = accel(step) - accel(still)
+    height = float(answer[-round(_SETTLED_S * _RATE_HZ) :].mean())
+    least = float(plant.T_L)
+    if abs(height) < 1e-3 * _STEP_MPS2:
+        return least
+    after = time >= _BEFORE_S
+    return max(float(trapezoid(1.0 - answer[after] / height, dx=1 / _RATE_HZ)), least)
+
+
+HORIZON_S = 10.0
+_FARTHEST = 4.0  # times as large or small, that lag and gain may be on the car
+_MATERIAL = {"T_L": 0.1, "K_L": 0.03}  # difference that a controller notices, of how late the car answers and of K_L
+
+
+def rollout_errors(logs: Sequence[Log], simulated: Sequence[Log]) -> dict[str, float]:
+    """Root mean squared error of the simulator's output as it is, by channel: acceleration [m/s²], and the speed that
+    it gains within 10 s [m/s], over usable rows.
+    """
+    errors: dict[str, list[FloatArray]] = {}
+    for log, other in zip(logs, simulated, strict=True):
+        usable = log.usable & other.engaged
+        for part in other.engaged_segments():
+            if log.accel is not None and other.accel is not None:
+                errors.setdefault("accel", []).append((other.accel - log.accel)[part][usable[part]])
+            if log.speed is not None and other.speed is not None:
+                rows = max(1, round(HORIZON_S * log.rate_hz))
+                for begin in range(part.start, part.stop, rows):
+                    own = slice(begin, min(begin + rows, part.stop))
+                    away = (other.speed - log.speed)[own]
+                    errors.setdefault("speed", []).append((away - away[0])[usable[own]])
+    joined = {name: np.concatenate(parts) for name, parts in errors.items()}
+    return {name: float(np.sqrt(np.mean(x**2))) for name, x in joined.items() if len(x)}
+
+
+def lag_and_gain(
+    logs: Sequence[Log], outputs: Sequence[Log], surrogate: GapPlant, found: Diagnosis
+) -> list[ParameterDifference]:
+    """T_L and K_L of the `surrogate`, with the effects that were `found`, fitted to the car's `logs`.
+
+    They differ as the simulator's own parameters do (`adjusted`), by more than a controller notices, and where the
+    likelihood, another engine, finds them away to the same side: each has a weak place of its own, the one where an
+    effect's size trades with the gain, the other where a recorder colours the noise. What a controller notices of a lag
+    is how much later the car answers, of all its lateness.
+    """
+    before = {name: float(getattr(surrogate, name)) for name in _MATERIAL}
+    car = surrogate if found.plant is None else found.plant
+
+    def drive(places: Sequence[Mapping[str, float]]) -> list[list[Log]]:
+        others = [GapPlant(car.effects, T_L=values["T_L"], K_L=values["K_L"], sigma=0.0) for values in places]
+        return [[replace(out, **responses(out, other)) for out in outputs] for other in others]
+
+    limits = {name: (x / _FARTHEST, x * _FARTHEST) for name, x in before.items()}
     try:
-        with ProcessPoolExecutor(count, copies, _take_over, (simulator, call)) as pool:
-            return list(pool.map(_called, each))
-    except BrokenProcessPool:
-        raise InputError("simulator: ended the process that drove it") from None
+        fitted = adjusted(Rollouts(logs, before, drive, most=100), limits)
+    except InputError:  # a drive too short for blocks to be held out
+        return []
+    likely = {**found.baseline, **found.winner.moved}  # which have lag and gain only where these were fitted
+    speeds = [log.speed[log.usable].mean() for log in logs if log.speed is not None and log.usable.any()]
+    whole = {"T_L": lateness(surrogate, float(np.mean(speeds)) if speeds else 0.0), "K_L": before["K_L"]}
+    return [
+        replace(p, own=False, differs=p.differs and _noticed(p, likely.get(p.name, p.car).mean, whole[p.name]))
+        for p in fitted.parameters
+    ]
 
 
-def _take_over(simulator: Simulator, call: Callable[[Simulator, Values], Any]) -> None:
-    global _copied
-    _copied = simulator, call
+def _noticed(parameter: ParameterDifference, likely: float, whole: float) -> bool:
+    least = _MATERIAL[parameter.name] * whole
+    away = [x - parameter.simulator for x in (parameter.car.mean, likely)]
+    return min(away) > least or max(away) < -least
 
 
-def _called(values: Values) -> Any:
-    assert _copied is not None
-    simulator, call = _copied
-    return call(simulator, values)
+def _parameters(found: Diagnosis, effect: str) -> dict[str, Quantity]:
+    """Of an effect of the verdict, from the budget's part where there is one."""
+    parts = [] if found.budget is None else [p for p in found.budget.parts if p.name == effect]
+    if parts:
+        return dict(parts[0].parameters)
+    alone = found.verdict.names == (effect,)
+    keys = {key if alone else key.removeprefix(f"{effect}."): q for key, q in found.winner.parameters.items()}
+    return {key: q for key, q in keys.items() if alone or f"{effect}.{key}" in found.winner.parameters}
+
+
+def _of_a_size(found: Diagnosis, effect: str, simulator: GapPlant) -> bool:
+    """Whether the simulator has the effect at about the car's size, so that its parameter may be wrong, and the effect
+    is not missing."""
+    own = simulator.report().get(effect, {})
+    for key, car in _parameters(found, effect).items():
+        if key in own:
+            return abs(float(own[key])) > SAME_KIND * abs(car.mean)
+    return False

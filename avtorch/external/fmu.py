@@ -12,9 +12,8 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
@@ -25,7 +24,6 @@ from numpy.typing import ArrayLike
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.external import fmu_process
-from avtorch.external.fmu_process import NOT_RUNNING
 from avtorch.external.fmu_variables import SIGNALS, STARTS, Variable, ports
 from avtorch.io.mapping import mapping_beside
 from avtorch.io.opening import place, read_toml
@@ -101,6 +99,7 @@ class FmuSimulator:
         self._start_notes: tuple[str, ...] = ()
         self._drive: object | None = None  # as long as it is also the process's, the drive goes on
         self._step: float | None = None  # where an FMU that states none wants all steps alike
+        self._time = 0.0  # s of the drive
 
     # what it is ----------------------------------------------------------------------------------------------------
     @property
@@ -108,7 +107,7 @@ class FmuSimulator:
         """What was taken for what, in which unit and in which steps, and where the last drive began."""
         listing, h = self._listing, self._listing["step"]
         made = f", made by {printable(listing['made_by'], 60)}" if listing["made_by"] else ""
-        notes = [f"{place(self.path)}: {listing['form']}{made}", *listing["remarks"]]
+        notes = [f"{place(self.path)}: {listing['form']}{made}"]
         notes += [port.note for port in self._ports.values()]
         notes += [f"{s}: cannot be set; a drive begins at the FMU's own" for s in STARTS if s not in self._ports]
         taken = {port.variable.name for port in self._ports.values()}
@@ -171,10 +170,10 @@ class FmuSimulator:
             "outputs": [port.where for port in shown],
         }
         self._process.begun()
-        begun = self._process.ask(request, OPENING_S)["shown"]
+        (begun,) = self._process.ask(request, OPENING_S)
         self._drive = self._process.drive = object()
-        self._step = None
-        self._start_notes = _start_notes(zip(("accel", "speed"), begun, shown, (accel, speed), strict=True))
+        self._step, self._time = None, 0.0
+        self._start_notes = _start_notes(zip(("accel", "speed"), begun["shown"], shown, (accel, speed), strict=True))
 
     def step(self, accel_cmd: float, dt: float) -> tuple[float, float]:
         """Hold the command [m/s²] for `dt` [s]; the acceleration [m/s²] and speed [m/s] at the end of it.
@@ -215,7 +214,10 @@ class FmuSimulator:
         self._step = float(dt[0])
         sent = (command / self._ports["accel_cmd"].factor).tolist()
         steps = list(zip(sent, length.tolist(), count.astype(int).tolist(), strict=True))
-        shown = np.array(self._process.ask({"steps": steps}, self._process.timeout_s)["shown"])
+        times = self._time + np.cumsum(np.append(0.0, dt))
+        answers = self._process.ask({"steps": steps}, self._process.timeout_s, times[:-1].tolist())
+        self._time = float(times[-1])
+        shown = np.array([answer["shown"] for answer in answers])
         return shown[:, 0] * self._ports["accel"].factor, shown[:, 1] * self._ports["speed"].factor
 
     def _parts(self, dt: FloatArray, before: float | None) -> tuple[FloatArray, FloatArray]:
@@ -297,16 +299,14 @@ class _Process:
         if self.alive:
             return self._listing
         folder = tempfile.TemporaryDirectory(prefix="avtorch_fmu_", ignore_cleanup_errors=True)
-        clock, unpacked = Path(folder.name, "clock"), Path(folder.name, "fmu")
-        clock.write_bytes(np.array([NOT_RUNNING]).tobytes())
+        unpacked = Path(folder.name, "fmu")
         unpacked.mkdir()
-        self._clock = np.memmap(clock, np.float64, "r", shape=(1,))
         # -P: nothing of the folder that the user happens to work in; a file, as its package would load PyTorch
         command = [sys.executable or "python", "-P", "-W", "ignore", fmu_process.__file__]
         environment = dict(os.environ, PYTHONPATH=os.pathsep.join(part for part in sys.path if part))
         try:
             self._child = subprocess.Popen(
-                [*command, os.fspath(self._path), self.source, os.fspath(unpacked), os.fspath(clock)],
+                [*command, os.fspath(self._path), os.fspath(unpacked)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -319,46 +319,41 @@ class _Process:
         self._lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         threading.Thread(target=_forward, args=(self._child.stdout, self._lines), daemon=True).start()
         self._finish = weakref.finalize(self, _end, self._child, folder)
-        self._listing = self.ask(None, OPENING_S)
+        (self._listing,) = self.ask(None, OPENING_S)
         return self._listing
 
-    def ask(self, request: dict[str, Any] | None, timeout_s: float) -> dict[str, Any]:
-        """The answer to a request, or what the process says first. Any error, an interruption too, ends the process:
-        the rest of an answer would be taken for the next one. Raises `InputError` naming the simulated time."""
+    def ask(
+        self, request: dict[str, Any] | None, timeout_s: float, times: Sequence[float | None] = (None,)
+    ) -> list[dict[str, Any]]:
+        """The answers to a request, or what the process says first; `times` [s] of the drive at which what each answers
+        begins. Any error, an interruption too, ends the process: the rest of an answer would be taken for the next one.
+        Raises `InputError` naming the simulated time."""
         try:
             if request is not None:
                 with suppress(OSError):  # where it has ended, the answer tells how
                     self._child.stdin.write(json.dumps(request).encode() + b"\n")  # type: ignore[union-attr]
                     self._child.stdin.flush()  # type: ignore[union-attr]
-            answer = self._answer(timeout_s)
-            if "refused" in answer:
-                raise InputError(answer["refused"])
-            if "error" in answer:
-                raise self._failed(answer["error"])
-            return answer
+            return [self._answer(timeout_s, at) for at in times]
         except BaseException:
             self.end()
             raise
 
-    def _answer(self, timeout_s: float) -> dict[str, Any]:
-        """The next line, as long as the clock does not stand still for `timeout_s`."""
-        shown, since = math.nan, time.monotonic()
-        while True:
-            with suppress(queue.Empty):
-                try:
-                    return json.loads(self._lines.get(timeout=min(timeout_s / 8, 1.0)))
-                except ValueError:
-                    raise self._failed(f"it ended the process that ran it ({_ending(self._child)})") from None
-            if self._clock[0] != shown:
-                shown, since = float(self._clock[0]), time.monotonic()
-            elif time.monotonic() - since > timeout_s:
-                more = "" if timeout_s == OPENING_S else "; a longer timeout_s gives it more"
-                raise self._failed(f"it does not answer within {timeout_s:g} s{more}")
-
-    def _failed(self, what: str) -> InputError:
-        at = float(self._clock[0])
-        when = "before the first step" if at == NOT_RUNNING else f"in the step that begins at {at:.6g} s of the drive"
-        return InputError(f"{self.source}: {when}: {what}")
+    def _answer(self, timeout_s: float, at: float | None) -> dict[str, Any]:
+        try:
+            answer = json.loads(self._lines.get(timeout=timeout_s))
+        except queue.Empty:
+            more = "" if timeout_s == OPENING_S else "; a longer timeout_s gives it more"
+            what = f"it does not answer within {timeout_s:g} s{more}"
+        except ValueError:
+            what = f"it ended the process that ran it ({_ending(self._child)})"
+        else:
+            if "refused" in answer:
+                raise InputError(f"{self.source}: {answer['refused']}")
+            if "error" not in answer:
+                return answer
+            what = answer["error"]
+        when = "before the first step" if at is None else f"in the step that begins at {at:.6g} s of the drive"
+        raise InputError(f"{self.source}: {when}: {what}")
 
 
 def _forward(stream: IO[bytes], lines: queue.SimpleQueue[bytes]) -> None:

@@ -161,14 +161,16 @@ def load_simulator(text: str, *, mapping: str | PathLike[str] | None = None) -> 
         try:
             found = found()
         except Exception as error:
-            what = (
-                f"simulator: {text} raised {type(error).__name__} when called without arguments; {quoted(str(error))}"
-            )
-            raise InputError(what) from error
-    if not isinstance(found, Simulator):
-        missing = " and ".join(n for n in ("reset", "step") if not callable(getattr(found, n, None)))
-        raise InputError(f"simulator: {text} has no {missing}; needs reset(speed, accel) and step(accel_cmd, dt)")
-    return found
+            raised = f"raised {type(error).__name__} when called without arguments"
+            raise InputError(f"simulator: {text} {raised}; {quoted(str(error))}") from error
+    return check_methods(found, text)
+
+
+def check_methods(simulator: Any, name: str) -> Simulator:
+    """The simulator. Raises `InputError` for an object without `reset` and `step`."""
+    if missing := " and ".join(n for n in ("reset", "step") if not callable(getattr(simulator, n, None))):
+        raise InputError(f"simulator: {name} has no {missing}; needs reset(speed, accel) and step(accel_cmd, dt)")
+    return simulator
 
 
 def _module(home: str) -> object:

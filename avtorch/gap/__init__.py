@@ -10,7 +10,6 @@ Example:
     ('dead_time', 0.4)
 """
 
-from avtorch.gap import effects
 from avtorch.gap.effects import (
     AerodynamicDrag,
     Backlash,
@@ -38,11 +37,17 @@ from avtorch.gap.effects import (
     SpeedSensorLag,
     ViscousDrag,
 )
-from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import EFFECTS, PLACES, Effect, NoiseChange, effect_class, register
-from avtorch.gap.simulator.effect_context import EffectContext
+from avtorch.gap.simulator.effect import (
+    EFFECTS,
+    PLACES,
+    Effect,
+    EffectContext,
+    NoiseChange,
+    effect_class,
+    register,
+)
 from avtorch.gap.simulator.force_table import FREE_FORMS, ForceTable, ResistanceCurve
-from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.parameter import Domain, Parameter
 from avtorch.gap.simulator.plant import BASELINE, GapPlant, plant
 from avtorch.gap.simulator.recursion import scan, scan_pair
 from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
@@ -88,7 +93,6 @@ __all__ = [
     "SpeedSensorLag",
     "ViscousDrag",
     "effect_class",
-    "effects",
     "plant",
     "register",
     "scan",

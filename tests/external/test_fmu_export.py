@@ -35,6 +35,7 @@ from avtorch.gap import (
     SimulatorInput,
     plant,
 )
+from avtorch.gap.simulator.around import Around
 
 DT, ROWS = 0.05, 120
 TIME = np.arange(ROWS) * DT
@@ -151,8 +152,9 @@ def test_around_a_simulator_the_whole_is_the_plant(tmp_path: Path) -> None:
     rows, refused = json.loads(done.stdout.splitlines()[-1])
     assert refused, "a step of another length is an error"
     accel, speed = np.array(rows).T
-    drive = SimulatorInput(torch.tensor(TIME), torch.tensor(COMMAND), torch.tensor(speed))
-    expected = car.response(drive, actuator0=torch.tensor(COMMAND[0]))
+    start = Around(plant(car.effects[:-1]), DT).car(COMMAND[0], COMMAND[0], speed[0])[0]  # without the sensor
+    drive = SimulatorInput(torch.tensor(TIME), torch.tensor(COMMAND), torch.tensor(speed), start)
+    expected = car.response(drive)
     close = {"rtol": 0.0, "atol": 8 * ROWS * 2.0**-52 * speed.max()}
     np.testing.assert_allclose(accel, expected.accel_measured.numpy(), **close)
     np.testing.assert_allclose(speed, expected.speed.numpy(), **close)

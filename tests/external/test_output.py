@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from avtorch import ExternalSimulator, InputError, diagnose
-from avtorch.external.answer import discrepancy, without_discrepancy
 from avtorch.external.driving import aligned
+from avtorch.external.external_simulator import discrepancy, without_discrepancy
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.io import Log
 from tests.external.cars import OWN, drive
@@ -50,20 +50,19 @@ def test_the_discrepancy_is_what_the_surrogate_leaves(as_it_is: tuple[Log, Log],
 def test_clocks_are_brought_together_by_the_commands(as_it_is: tuple[Log, Log]) -> None:
     car, simulated = as_it_is
     late = replace(simulated, time=simulated.time + 12.345)
-    found = aligned(late, car)
-    assert found.offset_s == pytest.approx(12.345, abs=0.02)  # a command is held for that long
-    assert found.log.rows == car.rows
-    inside = found.log.engaged
-    assert np.abs(found.log.accel - simulated.accel)[inside].max() < 0.1  # steps of 1 m/s², and a clock 5 ms off
-    again = aligned(simulated, car)
-    assert again.offset_s == 0.0
+    found, offset_s = aligned(late, car)
+    assert offset_s == pytest.approx(12.345, abs=0.02)  # a command is held for that long
+    assert found.rows == car.rows
+    inside = found.engaged
+    assert np.abs(found.accel - simulated.accel)[inside].max() < 0.1  # steps of 1 m/s², and a clock 5 ms off
+    assert aligned(simulated, car)[1] == 0.0
 
 
 def test_another_rate_is_interpolated(as_it_is: tuple[Log, Log]) -> None:
     car, simulated = as_it_is
     thin = simulated[slice(0, simulated.rows, 2)]
-    found = aligned(replace(thin, accel_cmd=None), car)
-    assert np.abs(found.log.speed - simulated.speed)[:-2].max() < 2e-3
+    found, _ = aligned(replace(thin, accel_cmd=None), car)
+    assert np.abs(found.speed - simulated.speed)[:-2].max() < 2e-3
 
 
 def test_commands_of_another_drive_are_refused(as_it_is: tuple[Log, Log]) -> None:

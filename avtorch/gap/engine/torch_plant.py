@@ -26,9 +26,8 @@ from avtorch.gap.engine.compiled_plant import _FREE_DAMPING
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, NEUTRAL, Coordinate, base_name
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.simulator.actuator import Actuator, Substep
-from avtorch.gap.simulator.effect import Effect
-from avtorch.gap.simulator.effect_context import EffectContext, context_at
-from avtorch.gap.simulator.order import at_place, in_order, substeps
+from avtorch.gap.simulator.chain import at_place, in_order, substeps
+from avtorch.gap.simulator.effect import Effect, EffectContext, context_at
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.gap.simulator.simulator_input import SimulatorInput
 

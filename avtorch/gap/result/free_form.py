@@ -36,9 +36,9 @@ from avtorch.gap.engine.priors import MAP_SIZE
 from avtorch.gap.engine.sample import sample
 from avtorch.gap.result.budget import HORIZON_S
 from avtorch.gap.result.output_error import SETTLED_S, STEP_S, Coefficients, Rows, Runs
-from avtorch.gap.simulator.effect_context import EffectContext
+from avtorch.gap.simulator.chain import at_place
+from avtorch.gap.simulator.effect import EffectContext
 from avtorch.gap.simulator.force_table import ForceTable, ResistanceCurve
-from avtorch.gap.simulator.order import at_place
 from avtorch.gap.simulator.plant import GapPlant, plant
 
 INDEPENDENT_S = 2.0

@@ -169,8 +169,8 @@ def outside(parameter: Parameter, q: Quantity) -> bool:
 def _sentence(name: str, p: Parameter, q: Quantity) -> str:
     unit = unit_of(p.name)
     low, high = p.physical
-    why = p.beyond or f"possible are {low:.2g} to {high:.2g}"
-    return f"{name} is {q.mean:.2g}{'' if unit == '-' else ' ' + unit}, typical {p.low:.2g} to {p.high:.2g}: {why}"
+    size = f"{name} is {q.mean:.2g}{'' if unit == '-' else ' ' + unit}"
+    return f"{size}, typical {p.low:.2g} to {p.high:.2g}: possible are {low:.2g} to {high:.2g}"
 
 
 @dataclass(frozen=True)

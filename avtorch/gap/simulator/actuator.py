@@ -11,13 +11,15 @@ first and second order by scans, the rate limit row by row.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
-from avtorch.gap.simulator.nonlinear_recursion import solve
-from avtorch.gap.simulator.rate_limited import by_rows
+from avtorch.arrays import FloatArray
 from avtorch.gap.simulator.recursion import scan, scan_pair
 from avtorch.vehicle.glvd import motion_coefficients
 
@@ -85,27 +87,54 @@ class Actuator:
         """
         steps = parts[0].target.shape[-1] - 1
         parts = [part.rows(slice(0, steps)) for part in parts]
+        rows = self._rows(accel0, parts)
+        before = ActuatorState(*(None if x is None else x[..., :-1] for x in vars(rows).values()))
+        return rows.accel, self.step(before, parts)[1]
+
+    def _rows(self, accel0: Tensor, parts: list[Substep]) -> ActuatorState:
+        """The states (..., time) of all rows."""
         if self.tau is not None:
-            return self._second_over(accel0, parts)
+            return self._second_rows(accel0, parts)
         jerk = self.limits
         if jerk is None:
-            return _first_over(accel0, parts)
-
-        def step(before: Tensor, rows: slice) -> tuple[Tensor, Tensor]:
-            slope = torch.ones_like(before)
+            alpha, beta = torch.ones(1, dtype=accel0.dtype), torch.zeros(())
             for part in parts:
-                before, own = _limited(before, part.rows(rows), jerk)[:2]
-                slope = slope * own
-            return before, slope
-
-        # row by row without derivatives; one Newton iteration then supplies them
+                ratio = part.length / part.lag
+                keep = torch.exp(-ratio)
+                alpha, beta = alpha * keep, keep * beta - torch.expm1(-ratio) * part.target
+            return ActuatorState(_joined(accel0, scan(alpha, beta, accel0)))
         rows = by_rows(accel0, parts, jerk)
-        a = _joined(accel0, rows if torch.is_inference_mode_enabled() else solve(step, accel0, rows))
-        at, gained = a[..., :-1], torch.zeros_like(a[..., 1:])
+        later = _linearised(lambda a, part: _limited(a, part, jerk)[:2], parts, accel0, rows)
+        return ActuatorState(_joined(accel0, later))
+
+    def _second_rows(self, accel0: Tensor, parts: list[Substep]) -> ActuatorState:
+        assert self.tau is not None
+        target, jerk = None, self.limits
+        if jerk is not None:
+            rows = by_rows(accel0, parts, jerk, slews=True)
+            target = _joined(accel0, _linearised(lambda r, part: _slewed(r, part, jerk)[:2], parts, accel0, rows))
+            at, means = target[..., :-1], []
+            for part in parts:
+                at, _, mean = _slewed(at, part, jerk)
+                means.append(Substep(mean, part.lag, part.length))
+            parts = means
+        one, zero = torch.ones(1, dtype=accel0.dtype), torch.zeros(1, dtype=accel0.dtype)
+        m, b = (one, zero, zero, one), (zero, zero)
         for part in parts:
-            at, _, speed = _limited(at, part, jerk)
-            gained = gained + speed
-        return a, gained
+            n = modes_over(self.tau, part.lag, part.length)
+            b = (
+                n[0] * b[0] + n[1] * b[1] + (1 - n[0]) * part.target,
+                n[2] * b[0] + n[3] * b[1] - n[2] * part.target,
+            )
+            m = (
+                n[0] * m[0] + n[1] * m[2],
+                n[0] * m[1] + n[1] * m[3],
+                n[2] * m[0] + n[3] * m[2],
+                n[2] * m[1] + n[3] * m[3],
+            )
+        rest = torch.zeros_like(accel0)
+        a, swing = scan_pair(m, b, (accel0, rest))
+        return ActuatorState(_joined(accel0, a), _joined(rest, swing), target)
 
     def _part(self, state: ActuatorState, part: Substep) -> tuple[ActuatorState, Tensor, Tensor]:
         g, T, h = part.target, part.lag, part.length
@@ -130,55 +159,9 @@ class Actuator:
         place = place - (self.tau * self.tau * (accel - state.accel) - w * h)
         return ActuatorState(accel, swing, slewed), speed, place
 
-    def _second_over(self, accel0: Tensor, parts: list[Substep]) -> tuple[Tensor, Tensor]:
-        assert self.tau is not None
-        if self.limits is not None:
-            parts = _slewed_over(accel0, parts, self.limits)
-        maps = []
-        for part in parts:
-            m = modes_over(self.tau, part.lag, part.length)
-            maps.append((m, ((1 - m[0]) * part.target, -m[2] * part.target)))
-        (m, b), *more = maps
-        for n, c in more:
-            b = (n[0] * b[0] + n[1] * b[1] + c[0], n[2] * b[0] + n[3] * b[1] + c[1])
-            m = (
-                n[0] * m[0] + n[1] * m[2],
-                n[0] * m[1] + n[1] * m[3],
-                n[2] * m[0] + n[3] * m[2],
-                n[2] * m[1] + n[3] * m[3],
-            )
-        rest = torch.zeros_like(accel0)
-        a, w = scan_pair(m, b, (accel0, rest))
-        a, w = _joined(accel0, a), _joined(rest, w)
-        at, swing, gained = a[..., :-1], w[..., :-1], torch.zeros_like(a[..., 1:])
-        for part, (own, add) in zip(parts, maps, strict=True):
-            after = own[0] * at + own[1] * swing + add[0]
-            swung = own[2] * at + own[3] * swing + add[1]
-            gained = gained + part.target * part.length - part.lag * (after - at) - (swung - swing)
-            at, swing = after, swung
-        return a, gained
-
 
 def _joined(first: Tensor, later: Tensor) -> Tensor:
     return torch.cat([first.expand(later.shape[:-1])[..., None], later], -1)
-
-
-def _first_over(accel0: Tensor, parts: list[Substep]) -> tuple[Tensor, Tensor]:
-    alpha, beta = None, torch.zeros(())
-    for part in parts:
-        ratio = part.length / part.lag
-        keep, give = torch.exp(-ratio), -torch.expm1(-ratio)
-        alpha = keep if alpha is None else alpha * keep
-        beta = keep * beta + give * part.target
-    assert alpha is not None
-    a = _joined(accel0, scan(alpha if alpha.dim() else alpha[None], beta, accel0))
-    at, gained = a[..., :-1], torch.zeros_like(a[..., 1:])
-    for i, part in enumerate(parts):
-        last = i == len(parts) - 1
-        after = a[..., 1:] if last else at - torch.expm1(-part.length / part.lag) * (part.target - at)
-        gained = gained + part.target * part.length - part.lag * (after - at)
-        at = after
-    return a, gained
 
 
 def _limited(a: Tensor, part: Substep, jerk: Limits) -> tuple[Tensor, Tensor, Tensor]:
@@ -223,21 +206,58 @@ def _slewed(r: Tensor, part: Substep, jerk: Limits) -> tuple[Tensor, Tensor, Ten
     return after, (d.abs() > J * h).to(r.dtype), mean
 
 
-def _slewed_over(accel0: Tensor, parts: list[Substep], jerk: Limits) -> list[Substep]:
-    def step(before: Tensor, rows: slice) -> tuple[Tensor, Tensor]:
-        slope = torch.ones_like(before)
-        for part in parts:
-            before, own, _ = _slewed(before, part.rows(rows), jerk)
-            slope = slope * own
-        return before, slope
+def by_rows(start: Tensor, parts: Sequence[Substep], jerk: Limits, *, slews: bool = False) -> Tensor:
+    """States (..., time) after each row, from `start` (...), without derivatives: a first-order lag which `jerk`
+    limits; or with `slews` a target that moves to the given one no faster."""
+    each = [[x.detach() for x in (p.target, p.lag, p.length)] for p in parts]
+    limits = [x.detach().clamp_max(_NO_LIMIT) for x in jerk]
+    of_limits = [(*x.shape[:-1], 1) for x in limits]
+    shape = np.broadcast_shapes((*start.shape, 1), *of_limits, *(x.shape for p in each for x in p))
 
-    rows = by_rows(accel0, parts, jerk, slews=True)
-    ends = _joined(accel0, rows if torch.is_inference_mode_enabled() else solve(step, accel0, rows))
-    at, out = ends[..., :-1], []
-    for part in parts:
-        at, _, mean = _slewed(at, part, jerk)
-        out.append(Substep(mean, part.lag, part.length))
+    def columns(x: Tensor, time: int) -> FloatArray:
+        return x.expand(*shape[:-1], time).reshape(-1, time).numpy()
+
+    rows = np.stack([[columns(x, shape[-1]) for x in p] for p in each])
+    first = columns(start.detach()[..., None], 1)[:, 0]
+    most = np.stack([columns(x, 1)[:, 0] for x in limits])
+    return torch.from_numpy(_limited_rows(first, rows, most, slews)).reshape(shape)
+
+
+@njit(cache=True, error_model="numpy")
+def _limited_rows(
+    start: FloatArray, parts: FloatArray, limit: FloatArray, slews: bool
+) -> FloatArray:  # pragma: no cover - compiled
+    """(column, time) of `parts` (part, 3, column, time): targets, lags and lengths."""
+    _, _, columns, rows = parts.shape
+    out = np.empty((columns, rows))
+    for c in range(columns):
+        state, rise, fall = start[c], limit[0, c], limit[1, c]
+        for k in range(rows):
+            for p in range(parts.shape[0]):
+                g, T, h = parts[p, 0, c, k], parts[p, 1, c, k], parts[p, 2, c, k]
+                d = g - state
+                J = rise if d > 0 else fall
+                if slews:
+                    state += min(max(d, -J * h), J * h)
+                else:  # at the limit while it binds, then exponential
+                    at_limit = min(max(abs(d) / J - T, 0.0), h)
+                    left = d - np.copysign(J * at_limit, d)
+                    state = g - left * np.exp((at_limit - h) / T)
+            out[c, k] = state
     return out
+
+
+def _linearised(
+    step: Callable[[Tensor, Substep], tuple[Tensor, Tensor]], parts: Sequence[Substep], start: Tensor, rows: Tensor
+) -> Tensor:
+    """`rows` (..., time) again, as a linear recursion by the slopes of `step(before, part) -> (after, slope)` at each:
+    first derivatives flow to `start` and to what `step` depends on."""
+    before = after = torch.cat([start.detach().expand(rows.shape[:-1])[..., None], rows[..., :-1]], -1)
+    slope = torch.ones_like(before)
+    for part in parts:
+        after, own = step(after, part)
+        slope = slope * own.detach()
+    return scan(slope, after - slope * before, start)
 
 
 def modes_over(tau: Tensor, T: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -14,10 +14,17 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
+from avtorch.gap.simulator.chain import (
+    SimulationState,
+    at_place,
+    begin,
+    context_of,
+    drawn_for,
+    end_of_step,
+    substeps,
+)
 from avtorch.gap.simulator.effect import Effect
-from avtorch.gap.simulator.order import at_place, substeps
 from avtorch.gap.simulator.plant import GapPlant
-from avtorch.gap.simulator.stepping import ROUNDS, SimulationState, begin, context_of, drawn_for
 from avtorch.vehicle.arguments import tensor
 
 _COMMANDS, _SPEEDS = (-6.0, -1.0, 1.0, 3.0), (0.5, 5.0, 15.0, 35.0)  # m/s², m/s: where lags are looked for
@@ -65,45 +72,19 @@ class Around:
         T_L, K_L = tensor(plant.T_L), tensor(plant.K_L)
         # `begin` takes the car's acceleration: the actuator's, and the forces at this speed
         total = a + begin(plant.effects, a, v, tensor(u), self._dt, T_L, K_L, plant.seed).force
-        past = begin(plant.effects, total, v, tensor(u), self._dt, T_L, K_L, plant.seed)
-        seen, row = total, self._context(past, v)
-        for e in at_place(past.effects, "sensor"):
-            at = drawn_for(past, e, row, 0)
-            seen = e.advance(seen, at, e.start(seen, at))[0]
-        return replace(past, seen=seen, speed=v, seen_speed=v)
+        return begin(plant.effects, total, v, tensor(u), self._dt, T_L, K_L, plant.seed)
 
     def _next(self, past: SimulationState, accel: float, speed: float) -> SimulationState:
-        """The forces at the speed that they lead to, by trapezoids, as `stepping.move` has them."""
-        a, dt, memory = tensor(accel), self._dt, dict(past.memory)
-        before, own = self._shown
-        gained = speed - before
-        v, force = tensor(own + gained) + dt * past.force, past.force
-        bodies = at_place(past.effects, "body")
-        for _ in range(ROUNDS if bodies else 0):
-            force, after = torch.zeros_like(v), self._context(past, v)
-            for e in bodies:
-                y, memory[e.name] = e.advance(a, drawn_for(past, e, after, past.row), past.memory[e.name])
-                force = force + y
-            v = own + gained + 0.5 * dt * (past.force + force)
-        position = past.position + 0.5 * dt * (own + v)
-        after, seen = self._context(past, v), a + force
-        for e in at_place(past.effects, "sensor"):
-            seen, memory[e.name] = e.advance(seen, drawn_for(past, e, after, past.row), past.memory[e.name])
-        shown = v
-        for e in at_place(past.effects, "sensor", "speed"):
-            shown, memory[e.name] = e.advance(shown, after, past.memory[e.name])
-        return replace(past, seen=seen, seen_speed=shown, speed=v, position=position, force=force, memory=memory)
-
-    def _context(self, past: SimulationState, v: Tensor) -> Any:
-        moved = 0.5 * self._dt * (self._shown[1] + v) if past.row else torch.zeros_like(v)
-        return context_of(past, past.time, v, past.position + moved, self._dt)
+        before, own = (tensor(x) for x in self._shown)
+        end = end_of_step(past, tensor(accel), own, speed - before, past.position, self._dt)
+        return replace(end, position=past.position + 0.5 * self._dt * (own + end.speed))
 
     def _command(self, past: SimulationState, u: Tensor) -> tuple[Tensor, dict[str, Any]]:
         memory: dict[str, Any] = {}
-        row = context_of(past, past.time, past.speed, past.position, self._dt)
+        row = context_of(past, past.speed, past.position, self._dt)
 
         def hook(e: Effect, x: Tensor) -> Any:
-            y, memory[e.name] = e.advance(x, drawn_for(past, e, row, past.row), past.memory[e.name])
+            y, memory[e.name] = e.advance(x, drawn_for(past, e, row), past.memory[e.name])
             return y
 
         with torch.no_grad():

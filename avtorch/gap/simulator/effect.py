@@ -31,9 +31,7 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError, quoted
-from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect_context import EffectContext, context_at
-from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.parameter import Domain, Parameter
 from avtorch.vehicle.arguments import Number, broadcast, tensor
 
 Place = Literal["command", "actuator", "body", "sensor"]
@@ -51,13 +49,62 @@ _NAME = 60  # most characters of a name that may be a mistyped effect
 
 
 @dataclass(frozen=True)
+class EffectContext:
+    """The input of an effect besides its signal: one row (...) in simulation, whole drives (..., time) otherwise.
+
+    `time` [s] and step `dt` [s] to the next row; `position` [m] since the drive's start; the baseline's `T_L` [s],
+    `K_L` [-]; `normal`, standard normal draws for an effect that samples, None where the response is deterministic.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import AerodynamicDrag, EffectContext
+        >>> speed, one = torch.tensor([10.0, 30.0]), torch.tensor(1.0)
+        >>> time, dt, T_L = torch.tensor([0.0, 0.1]), 0.1 * one, 0.3 * one
+        >>> row = EffectContext(time, dt, measured_speed=speed, travelled=None, T_L=T_L, K_L=one)
+        >>> [round(a, 2) for a in AerodynamicDrag(4e-4).apply(0 * speed, row).tolist()]
+        [-0.04, -0.36]
+    """
+
+    time: Tensor
+    dt: Tensor
+    measured_speed: Tensor | None
+    travelled: Tensor | None
+    T_L: Tensor
+    K_L: Tensor
+    normal: Tensor | None = None
+    whole: bool = True
+
+    @property
+    def speed(self) -> Tensor:
+        """[m/s], not below 0; the measured speed, if the drive is a log. Raises `InputError` if it was not measured."""
+        if self.measured_speed is None:
+            raise InputError("speed: not in the drive, needed by an effect that depends on it")
+        return self.measured_speed.clamp_min(0.0)
+
+    @property
+    def position(self) -> Tensor:
+        """[m], the integrated measured speed. Raises `InputError` where it was not measured."""
+        if self.travelled is None:
+            raise InputError("speed: not in the drive, needed by an effect that depends on position")
+        return self.travelled
+
+
+def context_at(row: EffectContext, k: int) -> EffectContext:
+    """One row of a whole drive."""
+
+    def pick(x: Tensor | None) -> Any:
+        return None if x is None else x if x.dim() == 0 else x[..., 0 if x.shape[-1] == 1 else k]
+
+    parts = (row.time, row.dt, row.measured_speed, row.travelled, row.T_L, row.K_L, row.normal)
+    return EffectContext(*(pick(x) for x in parts), whole=False)
+
+
+@dataclass(frozen=True)
 class NoiseChange:
     """The change that a random effect makes to the noise model; its deterministic response is zero.
 
     `force_sd` [m/s²] and `force_time` [s]: a coloured (Ornstein-Uhlenbeck) acceleration of the body, in both channels.
     `tail_fraction` of the accelerometer's samples has additional noise of `tail_scale` times its standard deviation.
-    `command_variance` (..., time) [(m/s²)²]: mean square difference between the command acting in a row and the one
-    logged there, independent from row to row.
 
     The diagnosis finds a user's random effect by it: as the gust or the outliers of the table that it is like. An
     effect to be tested returns one of the two: a force or tails.
@@ -66,15 +113,14 @@ class NoiseChange:
         >>> import torch
         >>> from avtorch.gap import Gust
         >>> change = Gust(sd_mps2=0.2, time_constant_s=2.2).noise(torch.zeros(100))
-        >>> float(change.force_sd), float(change.force_time), change.command_variance
-        (0.2, 2.2, None)
+        >>> float(change.force_sd), float(change.force_time)
+        (0.2, 2.2)
     """
 
     force_sd: Number | None = None
     force_time: Number | None = None
     tail_fraction: Number | None = None
     tail_scale: Number | None = None
-    command_variance: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -208,10 +254,7 @@ class Effect:
 
     def replaced(self, values: Mapping[str, Any]) -> Self:
         """The effect with other values. Raises `InputError` for a name that is no field of the effect."""
-        known = {f.name for f in fields(self)}
-        for name in values:
-            if name not in known:
-                raise InputError(f"{self.name}: found {quoted(name)}, needs one of {', '.join(sorted(known))}")
+        self._check_names(values)
         return replace(self, **values)
 
     @classmethod
@@ -228,11 +271,15 @@ class Effect:
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:
         """The effect from parameters under the answer's names. Raises `InputError` for other names."""
+        cls._check_names(values)
+        return cls(**values)
+
+    @classmethod
+    def _check_names(cls, values: Mapping[str, Any]) -> None:
         known = {f.name for f in fields(cls)}
         for name in values:
             if name not in known:
                 raise InputError(f"{cls.name}: found {quoted(name)}, needs one of {', '.join(sorted(known))}")
-        return cls(**values)
 
 
 def _stacked(rows: list[Tensor]) -> Tensor:
@@ -245,7 +292,7 @@ EFFECTS: dict[str, type[Effect]] = {}
 Example:
     >>> from avtorch.gap import EFFECTS
     >>> len(EFFECTS), [name for name, effect in EFFECTS.items() if effect.place == "sensor"]
-    (25, ['outliers', 'sensor_bias', 'sensor_lag', 'sensor_scale', 'speed_lag'])
+    (25, ['sensor_lag', 'speed_lag', 'sensor_scale', 'sensor_bias', 'outliers'])
 """
 
 E = TypeVar("E", bound=type[Effect])
@@ -295,12 +342,13 @@ def candidate_name(names: str | Iterable[str]) -> str:
 
 
 def chosen_effects(effects: Sequence[str | type[Effect]] | None) -> list[type[Effect]]:
-    """The classes of `effects` that a caller asks for, by name or class; all registered ones where it is None.
+    """The classes of `effects` that a caller asks for, by name or class; where it is None all registered
+    ones in alphabetical order.
 
     Raises `InputError` for a single name in place of a list, for anything that is no effect, and for one given twice.
     """
     if effects is None:
-        return list(EFFECTS.values())
+        return [EFFECTS[name] for name in sorted(EFFECTS)]
     if isinstance(effects, str):
         raise InputError(f"effects: found {quoted(effects)}, needs a list of names or classes")
     kinds: list[type[Effect]] = []

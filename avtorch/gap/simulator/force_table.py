@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect
-from avtorch.gap.simulator.effect_context import EffectContext
+from avtorch.gap.simulator.effect import Effect, EffectContext
+from avtorch.gap.simulator.parameter import Domain
 from avtorch.vehicle.arguments import tensor
 
 Row = tuple[float, ...]

@@ -1,4 +1,5 @@
-"""A parameter of an effect: its unit, its typical range, its prior, and its unconstrained coordinate for fits.
+"""A parameter of an effect: its unit, its typical range, its prior, its unconstrained coordinate for fits, and the
+values that a text may give it.
 
 Every prior is a standard normal `z` passed through a link, `value = link(location + spread z)`, so the prior of `z`
 needs no Jacobian and every coordinate of a fit has scale one. The typical range holds the prior's central 80 %.
@@ -10,18 +11,21 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, cast
+from itertools import pairwise
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, printable
 
 Constraint = Literal["real", "positive", "negative", "unit", "interval"]
 
 _CENTRAL_80 = 1.2815515655446004  # normal quantile of 0.9
-_LOG_2PI = math.log(2 * math.pi)
 _AS_FAR = 3.0  # multiple of the typical range, where an effect does not state what is possible
+
+# typical ranges come from experience: no car exceeds them a thousandfold, nor does a fit fall a million times below
+_FAR, _NEAR = 1e3, 1e6
 
 # torch.special has no types
 _normal_distribution = cast(Callable[[Tensor], Tensor], torch.special.ndtr)  # pyright: ignore[reportUnknownMemberType]
@@ -37,8 +41,7 @@ class Parameter:
     `reported` False: a coordinate that is fitted but not part of the answer. `size`: 1, or the length of a
     vector-valued coordinate, then on its last dimension. `of_onset`: identifiable only where an effect has an onset
     during a drive, and held at its prior's centre elsewhere. `possible`: the physically possible range; an answer
-    entirely outside it is reported as implausible, with the reason `beyond` ("wind and road do not do this"). Default:
-    three times the typical range, on the link's scale.
+    entirely outside it is reported as implausible. Default: three times the typical range, on the link's scale.
 
     Raises `InputError` for a range that is empty or outside the constraint.
 
@@ -62,7 +65,6 @@ class Parameter:
     size: int = 1
     of_onset: bool = False
     possible: tuple[float, float] | None = None
-    beyond: str = ""
 
     def __post_init__(self) -> None:
         if not self.low < self.high:
@@ -119,10 +121,6 @@ class Parameter:
         """`z` for a value, elementwise; infinite for a neutral value at the edge of the constraint."""
         return (self._link(value) - self.location) / self.spread
 
-    def log_prob(self, z: Tensor) -> Tensor:
-        """Log density of `z` under the prior, elementwise: the standard normal's."""
-        return -0.5 * z.square() - 0.5 * _LOG_2PI
-
     def typical(self) -> Tensor:
         """The prior's median."""
         shape = () if self.size == 1 else (self.size,)
@@ -151,3 +149,76 @@ def _ends(constraint: Constraint, low: float, high: float) -> tuple[float, float
     """`low` and `high` on the link's scale. Asked at every simulation of a fit."""
     first, last = (float(_link(constraint, low, high, torch.tensor(x, dtype=torch.float64))) for x in (low, high))
     return first, last
+
+
+@dataclass(frozen=True)
+class Domain:
+    """Valid values of field `name`: numbers from `low` to `high`, and `neutral`, at which the effect is zero, in any
+    case.
+
+    `whole`: whole numbers only. `most` above 0: a list of `least` to `most` numbers, `rising` or not.
+
+    Example:
+        >>> from avtorch.gap import Domain
+        >>> share = Domain("depth", low=0.0, high=1.0, neutral=0.0)
+        >>> share.value("gear_shift.depth", 0.7)
+        0.7
+    """
+
+    name: str
+    low: float
+    high: float
+    unit: str = ""
+    neutral: float | None = None
+    whole: bool = False
+    least: int = 1
+    most: int = 0
+    rising: bool = False
+
+    @classmethod
+    def of(cls, parameter: Parameter) -> Domain:
+        """The domain from a millionth of the typical range of `parameter` to a thousand times that range."""
+        low, high, kind = parameter.low, parameter.high, parameter.constraint
+        unit = "" if parameter.unit == "-" else parameter.unit
+        if kind == "interval":  # its ends depend on a drive, which is not known yet
+            return cls(parameter.name, -1e12, 1e12, unit)
+        ends = {
+            "positive": (low / _NEAR, high * _FAR),
+            "negative": (low * _FAR, high / _NEAR),
+            "unit": (0.0, 1.0),
+            "real": (-_FAR * max(abs(low), abs(high)), _FAR * max(abs(low), abs(high))),
+        }[kind]
+        return cls(parameter.name, *ends, unit, parameter.neutral)
+
+    def value(self, where: str, given: Any) -> Any:
+        """`given` as a float, an int or a tuple. Raises an `InputError` that begins with `where`."""
+        if not self.most:
+            return self._number(where, given)
+        count = len(cast("list[Any]", given)) if isinstance(given, list) else None
+        if count is None or not self.least <= count <= self.most:
+            what = _found(given) if count is None else f"a list of {count} values"
+            raise InputError(f"{where}: found {what}, needs a list of {self.least} to {self.most} numbers")
+        values = tuple(self._number(f"{where}[{i}]", x) for i, x in enumerate(cast("list[Any]", given)))
+        if self.rising and any(b <= a for a, b in pairwise(values)):
+            raise InputError(f"{where}: found {_found(given)}, needs numbers that rise")
+        return values
+
+    def _number(self, where: str, given: Any) -> float | int:
+        if isinstance(given, bool) or not isinstance(given, int | float):
+            raise InputError(f"{where}: found {_found(given)}, needs a number")
+        try:
+            value = float(given)
+        except OverflowError:
+            value = math.inf
+        if value == self.neutral:
+            return value
+        if not self.low <= value <= self.high or (self.whole and value != int(value)):
+            noun = "a whole number" if self.whole else "a number"
+            also = "" if self.neutral is None else f", or {self.neutral:g}"
+            unit = f" {self.unit}" if self.unit else ""
+            raise InputError(f"{where} is {value:g}, needs {noun} ({self.low:g} to {self.high:g}{unit}){also}")
+        return int(value) if self.whole else value
+
+
+def _found(given: Any) -> str:
+    return printable(repr(given), 40)

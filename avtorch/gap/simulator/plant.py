@@ -7,37 +7,31 @@
 from __future__ import annotations
 
 import copy
+import math
+import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import fields
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from avtorch.errors import InputError, quoted
-from avtorch.gap.simulator.effect import Effect, NoiseChange
-from avtorch.gap.simulator.order import in_order
-from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.plant_text import PlantDescription, names_a_file, parse_plant, read_file, to_toml
-from avtorch.gap.simulator.rollout import rollout
+from avtorch.gap.simulator.chain import SimulationState, begin, goes_on, in_order, move, rollout
+from avtorch.gap.simulator.effect import Effect, effect_class
+from avtorch.gap.simulator.force_table import FREE_FORMS
+from avtorch.gap.simulator.parameter import Domain, Parameter
 from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
-from avtorch.gap.simulator.stepping import SimulationState, begin, goes_on, move
+from avtorch.io.opening import parse_toml, place, read_toml
+from avtorch.numeral import numeral
 from avtorch.vehicle.arguments import Number, checked, tensor
 from avtorch.vehicle.plant import Motion
 
 BASELINE = (
-    Parameter(  # log-normal, median 0.3, log sd 0.7
-        "T_L",
-        "s",
-        None,
-        0.3 * 0.408,
-        0.3 * 2.452,
-        possible=(0.02, 5.0),
-        beyond="no actuator is that quick or that slow",
-    ),
-    Parameter(  # log-normal, median 1, log sd 0.3
-        "K_L", "-", None, 0.681, 1.469, possible=(0.3, 3.5), beyond="no actuator has that gain"
-    ),
+    Parameter("T_L", "s", None, 0.3 * 0.408, 0.3 * 2.452, possible=(0.02, 5.0)),  # log-normal, median 0.3, log sd 0.7
+    Parameter("K_L", "-", None, 0.681, 1.469, possible=(0.3, 3.5)),  # log-normal, median 1, log sd 0.3
 )
 """Parameters of the baseline, with their priors.
 
@@ -50,6 +44,16 @@ Example:
     >>> {p.name: [round(x, 2) for x in p.physical] for p in BASELINE}  # what physics allows at all
     {'T_L': [0.02, 5.0], 'K_L': [0.3, 3.5]}
 """
+
+
+_DOMAINS = {
+    "T_L": Domain("T_L", 1e-4, 1e3, "s"),
+    "K_L": Domain("K_L", 1e-4, 1e3, neutral=0.0),
+    "sigma": Domain("sigma", 0.0, 1e3, "m/s³"),
+}
+"""Valid values of the baseline's parameters in a text."""
+
+_LONGEST = 10_000  # most characters of a plant as a short string
 
 
 class GapPlant:
@@ -128,11 +132,6 @@ class GapPlant:
         """Parameters by effect, under the answer's names."""
         return {e.name: e.report(tensor(self.T_L)) for e in self.effects}
 
-    def noise(self, command: Tensor) -> dict[str, NoiseChange]:
-        """Change of the noise model by each random effect under commands (..., time)."""
-        changes = {e.name: e.noise(command) for e in self.effects}
-        return {name: change for name, change in changes.items() if change is not None}
-
     # whole drives --------------------------------------------------------------------------------------------------
     def response(
         self,
@@ -140,17 +139,15 @@ class GapPlant:
         parameters: Mapping[str, Tensor] | None = None,
         *,
         generator: torch.Generator | None = None,
-        actuator0: Tensor | None = None,
     ) -> Response:
         """The noise-free response to `drive`; with a `generator`, one in which the random effects are drawn.
 
         `parameters` by the names of `parameters()`, in their own units, each (...), which broadcast with the drive's
         leading dimensions (a vector-valued one has its size on a further, last dimension). Missing ones keep the
         plant's own value. Differentiable in all of them. Speed-dependent effects use the drive's measured speed.
-        `actuator0` (...) [m/s²]: the actuator's state at the first row, instead of the one given by the drive.
         """
         this = self if parameters is None else self.with_values(parameters)
-        return rollout(this.effects, tensor(this.T_L), tensor(this.K_L), drive, generator, actuator0=actuator0)
+        return rollout(this.effects, tensor(this.T_L), tensor(this.K_L), drive, generator)
 
     # one step ------------------------------------------------------------------------------------------------------
     @torch.no_grad()
@@ -173,7 +170,15 @@ class GapPlant:
     # as text -------------------------------------------------------------------------------------------------------
     def to_toml(self) -> str:
         """The plant as TOML; `from_toml` reads it. Raises `InputError` for parameters that are not single numbers."""
-        return to_toml(self.effects, {"T_L": self.T_L, "K_L": self.K_L, "sigma": self.sigma})
+        lines = [f"{name} = {_number(name, getattr(self, name))}" for name in ("T_L", "K_L", "sigma")]
+        for given in self.effects:
+            effect, _ = given.lag_apart()  # T_L is already written there
+            lines += ["", f"[{effect.name}]"]
+            for f in fields(effect):
+                value = getattr(effect, f.name)
+                if value is not None:
+                    lines.append(f"{f.name} = {_number(f'{effect.name}.{f.name}', value)}")
+        return "\n".join(lines) + "\n"
 
     @classmethod
     def from_toml(cls, text: str, *, effects: Iterable[type[Effect]] = ()) -> GapPlant:
@@ -182,7 +187,7 @@ class GapPlant:
 
         `effects`: classes besides the registered ones. Raises `InputError` for unknown names and wrong values.
         """
-        return _from(parse_plant(text, effects))
+        return _parsed(text, effects)
 
 
 def plant(
@@ -209,12 +214,12 @@ def plant(
         >>> list(car.report())
         ['dead_time', 'sensor_bias']
     """
-    if isinstance(baseline, str) and not names_a_file(baseline):
+    if isinstance(baseline, str) and not _names_a_file(baseline):
         base = GapPlant.from_toml(baseline)
     elif isinstance(baseline, GapPlant) or baseline is None:
         base = baseline or GapPlant((), T_L=0.3, K_L=1.0, sigma=0.1)
     else:
-        base = _from(read_file(baseline))
+        base = _read(baseline)
     if isinstance(effects, str):
         raise InputError(f"effects: found the text {quoted(effects)}; needs effects; plant(baseline=...) takes a text")
     own = [e() if isinstance(e, type) else e for e in effects]
@@ -243,6 +248,97 @@ def _joined(parts: Sequence[Tensor | None]) -> Tensor | None:
     return torch.cat(flat) if flat else None
 
 
-def _from(description: PlantDescription) -> GapPlant:
-    given = description.baseline
-    return plant(description.effects, T_L=given.get("T_L"), K_L=given.get("K_L"), sigma=given.get("sigma"))
+# as text -------------------------------------------------------------------------------------------------------------
+def _parsed(text: str, more: Iterable[type[Effect]] = ()) -> GapPlant:
+    """A plant from TOML or a short string; `"glvd"` or nothing is bare GLVD. Raises `InputError` for errors in the
+    text.
+
+    In a short string an effect's name sets its first parameter, `effect.parameter` any, and an effect without a value
+    has its typical ones.
+    """
+    if "\n" in text or "[" in text:
+        return _of(parse_toml(text, "plant"), more)
+    if len(text) > _LONGEST:
+        raise InputError(f"plant: found {len(text):,} characters, needs {_LONGEST:,} at most, or a TOML file")
+    tables: dict[str, Any] = {}
+    for item in filter(None, (x.strip() for x in text.split(","))):
+        key, equals, value = (x.strip() for x in item.partition("="))
+        if key.lower() == "glvd" and not equals:
+            continue
+        name, dot, parameter = key.partition(".")
+        if not equals:
+            known = effect_class(name, more).name if not dot else name
+            if known in tables or dot:
+                raise InputError(f"plant: found {quoted(item)}, needs an effect's name, once, or NAME=NUMBER")
+            tables[known] = {}
+            continue
+        try:
+            number = numeral(value)
+        except ValueError:
+            raise InputError(f"plant: found {quoted(item)}, needs a number after '='") from None
+        if key in _DOMAINS:
+            table, parameter = tables, key
+        else:
+            first = _first(effect_class(name, more))
+            table, parameter = tables.setdefault(name, {}), parameter if dot else first
+        if parameter in table:
+            raise InputError(f"plant: found {quoted(item)} besides another value, needs one")
+        table[parameter] = number
+    return _of(tables, more)
+
+
+def _names_a_file(text: str) -> bool:
+    """Whether a string is a file's name, existing or missing, and not a plant as text."""
+    if "\n" in text or text.strip().lower() in ("", "glvd"):
+        return False
+    try:
+        return text.strip().lower().endswith(".toml") or Path(text).is_file()
+    except (OSError, ValueError):  # too long for a name, or with a zero byte in it
+        return False
+
+
+def _read(path: str | PathLike[str]) -> GapPlant:
+    """A plant from a TOML file of up to 1 MB. Raises `InputError` where it cannot be read."""
+    if not os.path.lexists(path):
+        raise InputError(f"plant: {place(path)}: no such file; needs a TOML file, or effects such as dead_time=0.2")
+    try:
+        return _of(read_toml(path), ())
+    except InputError as fault:
+        raise InputError(f"plant: {fault}") from None
+
+
+def _number(name: str, value: Any) -> str:
+    if isinstance(value, Tensor):
+        if value.dim() > 1:
+            raise InputError(f"{name}: found shape {tuple(value.shape)}, needs a single value for a text")
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_number(name, x) for x in value) + "]"
+    if isinstance(value, int) and not isinstance(value, bool):
+        return repr(value)
+    value = float(value)
+    if math.isnan(value):
+        raise InputError(f"{name}: found nan, needs a number for a text")
+    return repr(value)
+
+
+def _of(tables: Mapping[str, Any], more: Iterable[type[Effect]]) -> GapPlant:
+    baseline: dict[str, Any] = {}
+    effects = []
+    more = (*FREE_FORMS, *more)
+    for name, value in tables.items():
+        if name in _DOMAINS:
+            baseline[name] = _DOMAINS[name].value(name, value)
+            continue
+        cls = effect_class(name, more)
+        table = value if isinstance(value, Mapping) else {_first(cls): value}
+        domains = cls.domains()
+        # an unknown name is passed on: the effect rejects it and lists the known ones
+        given = {key: domains[key].value(f"{name}.{key}", x) if key in domains else x for key, x in table.items()}
+        effects.append(cls.of(given))
+    return plant(effects, **baseline)
+
+
+def _first(cls: type[Effect]) -> str:
+    """The first parameter under the answer's name."""
+    return next(iter(cls().report(tensor(0.3))))

@@ -80,10 +80,10 @@ class SimulatorInput:
             object.__setattr__(self, name, value)
 
     @classmethod
-    def from_log(cls, log: Log, segment: int = 0, *, steady_start: bool = False) -> SimulatorInput:
+    def from_log(cls, log: Log, segment: int = 0) -> SimulatorInput:
         """One segment of a log, with time from the log's start.
 
-        It starts from the measured acceleration, if there is one, unless `steady_start`.
+        It starts from the measured acceleration, if there is one.
 
         Rows with `engaged` 0 are included: their commands act in the response, although the car did not follow them.
 
@@ -95,7 +95,7 @@ class SimulatorInput:
         if rows.sum() < 2:
             raise InputError(f"segment: found {segment}, needs a segment of the log with two rows or more")
         speed = None if log.speed is None else torch.as_tensor(log.speed[rows])
-        accel0 = None if log.accel is None or steady_start else float(log.accel[rows][0])
+        accel0 = None if log.accel is None else float(log.accel[rows][0])
         time, command = torch.as_tensor(log.elapsed[rows]), torch.as_tensor(log.accel_cmd[rows])
         return cls(time, command, speed, accel0, log.accel_kind == "specific-force")
 

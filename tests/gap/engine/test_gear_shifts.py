@@ -29,7 +29,7 @@ from avtorch.gap.engine.gear_shifts import (
 )
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.priors import SHIFT_NATS
-from avtorch.gap.simulator.effect_context import EffectContext
+from avtorch.gap.simulator.effect import EffectContext
 from tests.bars import log_odds
 
 DT, LAG, GAIN = 0.02, 0.3, 0.9

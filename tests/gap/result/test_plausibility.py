@@ -51,7 +51,7 @@ def shaken() -> Diagnosis:
 def test_a_gust_that_no_wind_makes_is_remarked_with_its_name(shaken: Diagnosis) -> None:
     assert shaken.verdict.names == ("gust",)
     assert shaken.winner.parameters["sd_mps2"].mean > 0.6  # what wind does; the engine's sizes end at 0.8
-    said_everywhere(shaken, "wind and road do not do this; the effect stands in for something else")
+    said_everywhere(shaken, "possible are 0 to 0.6; the effect stands in for something else")
     first = str(shaken).splitlines()[0]
     assert "physically implausible" in first
     assert Gust.meaning not in first
@@ -60,7 +60,7 @@ def test_a_gust_that_no_wind_makes_is_remarked_with_its_name(shaken: Diagnosis) 
 @pytest.mark.slow
 def test_a_gain_of_a_sixteenth_is_remarked() -> None:
     found = avtorch.diagnose(log_of(plant(T_L=0.3, K_L=0.06)), effects=[], pairs=False)
-    said_everywhere(found, "no actuator has that gain")
+    said_everywhere(found, "possible are 0.3 to 3.5")
 
 
 @pytest.mark.slow
@@ -81,17 +81,13 @@ def test_what_an_effect_reports_has_a_range_that_holds_its_typical_values(kind: 
         low, high = p.physical
         # a moment is on the log's own time, and may be any
         assert low <= p.low < p.high <= high
-        if not (p.constraint == "unit" and p.possible is None):
-            assert p.beyond or high == float("inf")
         for typical in (p.low, p.high):
             assert implausible({p.name: about(typical)}, {}, [kind]) == ()
 
 
 def test_one_interval_that_reaches_in_is_no_accusation() -> None:
     (late,) = implausible({"lag_s": Quantity(2.4, 0.1, 2.2, 2.6)}, {}, [SensorLag])
-    assert late.startswith(
-        "sensor_lag.lag_s is 2.4 s, typical 0.05 to 0.5: no accelerometer is so slow, but for a filter on its signal"
-    )
+    assert late.startswith("sensor_lag.lag_s is 2.4 s, typical 0.05 to 0.5: possible are 0 to 1")
     assert implausible({"lag_s": Quantity(2.4, 1.0, 0.9, 4.2)}, {}, [SensorLag]) == ()
     # of a pair each by its own name
     pair = {"sensor_lag.lag_s": about(0.2), "gust.sd_mps2": about(1.9), "gust.time_constant_s": about(2.0)}

@@ -52,8 +52,9 @@ def together(effects: Sequence[Effect], dt: float = DT) -> tuple[np.ndarray, np.
 
 def whole(effects: Sequence[Effect], speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The response over the whole drive, at the car's own speed; the actuator starts as the other simulator does."""
-    drive = SimulatorInput(torch.tensor(TIME), torch.tensor(COMMAND), torch.tensor(speed))
-    response = plant(effects, T_L=LAG, K_L=0.7).response(drive, actuator0=torch.tensor(COMMAND[0]))
+    start = Around(plant([e for e in effects if e.place != "sensor"]), DT).car(COMMAND[0], COMMAND[0], 20.0)[0]
+    drive = SimulatorInput(torch.tensor(TIME), torch.tensor(COMMAND), torch.tensor(speed), start)
+    response = plant(effects, T_L=LAG, K_L=0.7).response(drive)
     return response.accel_measured.numpy(), response.speed.numpy()
 
 

@@ -30,4 +30,4 @@ def test_effects_that_are_none(effects: object, message: str) -> None:
 
 def test_effects_by_name_and_by_class() -> None:
     assert chosen_effects(["dead_time", SensorBias]) == [EFFECTS["dead_time"], SensorBias]
-    assert chosen_effects(None) == list(EFFECTS.values())
+    assert chosen_effects(None) == [EFFECTS[name] for name in sorted(EFFECTS)]

@@ -333,8 +333,6 @@ def test_random_effects_have_no_deterministic_response(cls: type[Effect]) -> Non
     drawn = plant([cls]).response(drive, generator=torch.Generator().manual_seed(1))
     again = plant([cls]).response(drive, generator=torch.Generator().manual_seed(1))
     assert torch.equal(drawn.accel_measured, again.accel_measured)
-    (change,) = plant([cls]).noise(drive.command).values()
-    assert any(x is not None for x in vars(change).values())
 
 
 @pytest.mark.statistical
@@ -370,22 +368,15 @@ def test_outliers_have_the_stated_rate_and_size(rotating_seed: int, draws_factor
     assert float(error.square().mean()) == pytest.approx(size**2, abs=BAR * size**2 * math.sqrt(2 / len(error)))
 
 
-@pytest.mark.statistical
-def test_lost_messages_have_the_stated_mean_square(rotating_seed: int, draws_factor: int) -> None:
-    p, rows, count = 0.2, 60, 20_000 * draws_factor
+def test_over_a_drive_the_same_messages_are_lost_as_step_by_step(fresh_seed: int) -> None:
+    rows, count = 60, 50
     u = torch.sin(torch.arange(rows, dtype=D) * 0.3)
-    effect = gap.CommandHold(p)
+    effect = gap.CommandHold(0.2)
     row = gap.EffectContext(
         torch.arange(rows, dtype=D), torch.tensor(0.1, dtype=D), None, None, torch.ones(1), torch.ones(1)
     )
-    normal = torch.randn(count, rows, generator=torch.Generator().manual_seed(rotating_seed), dtype=D)
+    normal = torch.randn(count, rows, generator=torch.Generator().manual_seed(fresh_seed), dtype=D)
     held = effect.over(u, gap.EffectContext(**{**vars(row), "normal": normal}))
-    seen = (held - u).square()
-    told = effect.noise(u).command_variance
-    assert told is not None
-    far = BAR * seen.std(0) / math.sqrt(count) + 1e-9
-    assert bool(((seen.mean(0) - told).abs() < far)[20:].all())
-    # step by step the very same messages are lost
     state, out = effect.start(u[0], row), []
     for k in range(rows):
         y, state = effect.advance(u[k], gap.EffectContext(**{**vars(row), "normal": normal[:, k]}), state)

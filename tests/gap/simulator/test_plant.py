@@ -248,8 +248,6 @@ def test_drives_of_logs() -> None:
     assert drive.uniform
     response = plant([gap.AerodynamicDrag()]).response(drive)
     assert float(response.accel[0]) == pytest.approx(0.2)
-    steady_start = plant().response(SimulatorInput.from_log(log, steady_start=True))
-    torch.testing.assert_close(steady_start.accel, torch.full((100,), 0.5, dtype=D))
     with pytest.raises(InputError, match="segment"):
         SimulatorInput.from_log(log, 3)
 
@@ -268,7 +266,6 @@ def test_parameters_are_standard_normals_in_z(rotating_seed: int) -> None:
         drawn = p.sample(2000, generator=torch.Generator().manual_seed(rotating_seed))
         inside = float(((drawn > p.low) & (drawn < p.high)).double().mean())
         assert inside == pytest.approx(1.0 if p.constraint == "interval" else 0.8, abs=0.06)
-        assert float(p.log_prob(z[1])) == pytest.approx(-0.9189385332)
     car = plant()
     assert float(car.parameters()["T_L"].typical()) == pytest.approx(0.3, rel=1e-3)
     assert car.parameters()["K_L"].spread == pytest.approx(0.3, rel=1e-3)

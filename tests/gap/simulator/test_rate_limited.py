@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator import actuator
-from avtorch.gap.simulator.actuator import Actuator, ActuatorState, Substep
-from avtorch.gap.simulator.rate_limited import by_rows
+from avtorch.gap.simulator.actuator import Actuator, ActuatorState, Substep, by_rows
 
 D = torch.float64
 ROWS = 60

@@ -1,4 +1,4 @@
-"""Linear and nonlinear recursions over whole drives against plain loops."""
+"""Linear recursions over whole drives against plain loops."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import time
 import pytest
 import torch
 
-from avtorch.gap.simulator.nonlinear_recursion import solve
 from avtorch.gap.simulator.recursion import scan, scan_pair
 
 D = torch.float64
@@ -81,37 +80,6 @@ def test_derivatives(steps: int, constant: bool) -> None:
     more = [torch.randn(2, steps, dtype=D, requires_grad=True) for _ in range(2)]
     first = [torch.randn(2, dtype=D, requires_grad=True) for _ in range(2)]
     assert torch.autograd.gradcheck(lambda *p: scan_pair(p[:4], p[4:6], p[6:]), (*pair, *more, *first))
-
-
-def test_newton_is_the_loop() -> None:
-    torch.manual_seed(1)
-    push = torch.randn(3, 500, dtype=D, requires_grad=True)
-
-    def step(before: torch.Tensor, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
-        value = torch.tanh(before + push[..., rows])
-        return value, 1 - value * value
-
-    start = torch.zeros(3, dtype=D)
-    x, looped_x, at = solve(step, start, torch.zeros(3, 500, dtype=D)), [], start
-    for k in range(500):
-        at = torch.tanh(at + push[:, k])
-        looped_x.append(at)
-    torch.testing.assert_close(x, torch.stack(looped_x, -1), rtol=0, atol=1e-12)
-    (one,) = torch.autograd.grad(x.square().sum(), push)
-    (two,) = torch.autograd.grad(torch.stack(looped_x, -1).square().sum(), push)
-    torch.testing.assert_close(one, two, rtol=1e-9, atol=1e-9)
-
-
-def test_newton_falls_back_to_stepping() -> None:
-    def step(before: torch.Tensor, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
-        return 3.7 * before * (1 - before), 3.7 * (1 - 2 * before)  # chaotic: no few rounds settle it
-
-    start = torch.full((1,), 0.3, dtype=D)
-    x = solve(step, start, torch.full((1, 60), 0.5, dtype=D), rounds=1)
-    value = 0.3
-    for k in range(20):
-        value = 3.7 * value * (1 - value)
-        assert float(x[0, k]) == pytest.approx(value, abs=1e-6)
 
 
 def test_scan_is_fast() -> None:
