@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -144,6 +145,40 @@ def _numbers(name: str, stats: Mapping[str, float], parts: Sequence[str] = STATS
 
 def _named(stats: Mapping[str, Mapping[str, float]]) -> list[Row]:
     return [{"name": name, **_numbers("value", values)} for name, values in stats.items()]
+
+
+QUANTITIES = ("T_L", "K_L")
+
+Drive = Mapping[str, tuple[float, float]]
+"""What a drive says: mean and standard deviation of the coordinate of each quantity."""
+
+LEAST_SD = 1e-3
+"""Of a coordinate: no drive tells a lag or the size of an effect better than to a thousandth."""
+
+
+def drive_belief(used: Sequence[Row]) -> Drive | None:
+    """What the used windows of a drive say of log T_L and log K_L; None where an estimator gives no SD.
+
+    The standard deviation of their mean is by what the windows differ by, or by what their posteriors say, whichever is
+    more. What windows of a drive have in common is the spread from drive to drive.
+    """
+    found = {}
+    for name in QUANTITIES:
+        means, variances = [], []
+        for row in used:
+            mean, sd = row[f"{name}_mean"], row[f"{name}_sd"]
+            if mean is None or sd is None or not (math.isfinite(mean) and math.isfinite(sd) and mean > 0):
+                return None
+            variances.append(math.log1p((sd / mean) ** 2))
+            means.append(math.log(mean) - variances[-1] / 2)
+        count = len(means)
+        if not count:
+            return None
+        mean = sum(means) / count
+        spread = sum((x - mean) ** 2 for x in means) / max(1, count - 1)
+        variance = max(spread, sum(variances) / count) / count
+        found[name] = (mean, max(math.sqrt(variance), LEAST_SD))
+    return found
 
 
 def failure_rows(status: Status, why: str) -> list[Row]:

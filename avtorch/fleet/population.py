@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.fleet.ranking import LEAST_SD, QUANTITIES, Drive
+from avtorch.fleet.folder import LEAST_SD, QUANTITIES, Drive
 from avtorch.gap import EFFECTS
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.inference import SamplerSettings, sample

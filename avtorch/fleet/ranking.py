@@ -16,13 +16,12 @@ from datetime import UTC, datetime
 from statistics import fmean, pvariance
 from typing import Any
 
-from avtorch.fleet.folder import DATASETS, FleetFolder, Row
+from avtorch.fleet.folder import DATASETS, FleetFolder, Row, drive_belief
 from avtorch.fleet.log_list import FleetLog, LogList
 from avtorch.fleet.settings import FleetSettings
 from avtorch.version import __version__
 
 SCHEMA = "avtorch.fleet/1"
-QUANTITIES = ("T_L", "K_L")
 APART = 0.05
 """Expected share of false ones among the cars that are said to differ from their siblings."""
 
@@ -215,38 +214,6 @@ def _when(log: FleetLog) -> tuple[bool, datetime, str]:
         return False, datetime.min.replace(tzinfo=UTC), os.path.basename(log.place)
     date = datetime.fromisoformat(log.date)
     return True, date if date.tzinfo is not None else date.replace(tzinfo=UTC), log.place
-
-
-Drive = Mapping[str, tuple[float, float]]
-"""What a drive says: mean and standard deviation of the coordinate of each quantity."""
-
-LEAST_SD = 1e-3
-"""Of a coordinate: no drive tells a lag or the size of an effect better than to a thousandth."""
-
-
-def drive_belief(used: Sequence[Row]) -> Drive | None:
-    """What the used windows of a drive say of log T_L and log K_L; None where an estimator gives no SD.
-
-    The standard deviation of their mean is by what the windows differ by, or by what their posteriors say, whichever is
-    more. What windows of a drive have in common is the spread from drive to drive.
-    """
-    found = {}
-    for name in QUANTITIES:
-        means, variances = [], []
-        for row in used:
-            mean, sd = row[f"{name}_mean"], row[f"{name}_sd"]
-            if mean is None or sd is None or not (math.isfinite(mean) and math.isfinite(sd) and mean > 0):
-                return None
-            variances.append(math.log1p((sd / mean) ** 2))
-            means.append(math.log(mean) - variances[-1] / 2)
-        count = len(means)
-        if not count:
-            return None
-        mean = sum(means) / count
-        spread = sum((x - mean) ** 2 for x in means) / max(1, count - 1)
-        variance = max(spread, sum(variances) / count) / count
-        found[name] = (mean, max(math.sqrt(variance), LEAST_SD))
-    return found
 
 
 COMMON, SINGLE = 2 / 3, 1 / 3
