@@ -188,7 +188,9 @@ def to_autoware(plant: GapPlant) -> Exported:
     if acceleration_map(plant) is not None:
         tool += f", vehicle_model_type DELAY_STEER_MAP_ACC_GEARED with acceleration_map_path {ACCELERATION_MAP}"
         values["debug_acc_scaling_factor"] = 1.0  # the gain is in the map, as the free form is
-        others = GapPlant([e for e in plant.effects if not isinstance(e, FREE_FORMS)], T_L=plant.T_L, sigma=0.0)
+        others = GapPlant(
+            [e for e in plant.effects if not isinstance(e, FREE_FORMS)], T_L=plant.T_L, K_L=1.0, sigma=0.0
+        )
     limit = "limits that differ for driving and braking; the tool's one is the wider"
     return Exported(tool, values, tuple(_lost(others, limit=limit, overshoot=_OVERSHOOT)))
 
