@@ -30,7 +30,7 @@ from typing import Any
 
 import psutil
 
-from avtorch.fleet import FleetSettings, read_rows, run_fleet
+from avtorch.fleet import FleetLog, FleetSettings, read_rows, run_fleet
 from avtorch.fleet.cluster import Cluster
 from avtorch.fleet.folder import DATASETS
 from avtorch.fleet.log_list import content_hash
@@ -126,7 +126,7 @@ def _numbers(rows: list[dict[str, Any]]) -> list[int]:
 
 def _alone(path: Path, step: Step, settings: FleetSettings) -> list[dict[str, Any]]:
     sha256, size = content_hash(path)
-    return work(Task(path.stem, step, str(path), sha256, size, settings)).rows
+    return work(Task(step, FleetLog(str(path), path.stem), str(path), sha256, size, settings)).rows
 
 
 def _same(rows: list[dict[str, Any]], alone: list[dict[str, Any]]) -> bool:

@@ -23,6 +23,7 @@ from collections import Counter
 from collections.abc import Generator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import torch
@@ -32,9 +33,8 @@ from avtorch.arrays import FloatArray
 from avtorch.inference.stream import packed, unpacked
 from avtorch.io.answers import atomic
 from avtorch.io.log import STANDSTILL_MPS
-from avtorch.live import Answer, Batch, Counts, KeptCars, LineParser, LiveSettings, LiveWatch, Row, Stop, watch_source
-from avtorch.live.car import LiveWindow
-from avtorch.live.live_watch import window_answer
+from avtorch.live import Answer, Batch, Counts, KeptCars, LineParser, LiveSettings, LiveWatch, Row, watch_source
+from avtorch.live.car import window_answer
 from avtorch.live.watch_source import line_of
 
 RATE_HZ, PERIOD_S = 100, 0.01
@@ -137,7 +137,7 @@ class Stretch:
     def __init__(self, parser: LineParser, chunks: list[Chunk], begin: int) -> None:
         self.parser, self.chunks, self.begin = parser, chunks, begin
 
-    def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
+    def batches(self, stop: Event, start: int | None = None) -> Generator[Batch, None, None]:
         """As the contract of a source."""
         number = self.begin
         for part in self.chunks:
@@ -280,7 +280,7 @@ class Soak:
             for watched in watch.feed(rows[0], signals, self.setting, usable=usable):
                 self.numbers[car] += 1
                 number, name = self.numbers[car], f"car {car}"
-                entry = window_answer(name, LiveWindow(number, watched, 0.0, 0.0))
+                entry = window_answer(name, number, watched)
                 out[f"{name}/{number}"] = line_of(Answer(entry, name, number, 0.0))
         return out
 
@@ -388,7 +388,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     torch.set_num_threads(1)
-    soak, stop, begun = Soak(given.folder, given.cars, given.seed), Stop(), time.monotonic()
+    soak, stop, begun = Soak(given.folder, given.cars, given.seed), Event(), time.monotonic()
     before = signal.getsignal(signal.SIGINT)
 
     def on(number: int, frame: object) -> None:
@@ -397,7 +397,7 @@ def main() -> None:
         signal.signal(signal.SIGINT, before)
 
     signal.signal(signal.SIGINT, on)
-    while not stop.is_set and soak.progress.hours < given.hours and time.monotonic() - begun < 60 * given.minutes:
+    while not stop.is_set() and soak.progress.hours < given.hours and time.monotonic() - begun < 60 * given.minutes:
         soak.stretch()
         p = soak.progress
         print(

@@ -14,11 +14,12 @@ import argparse
 import json
 import time
 from collections.abc import Generator
+from threading import Event
 
 import numpy as np
 import torch
 
-from avtorch.live import Answer, Batch, Counts, LineParser, LiveSettings, LiveWatch, Row, Stop, watch_source
+from avtorch.live import Answer, Batch, Counts, LineParser, LiveSettings, LiveWatch, Row, watch_source
 from avtorch.live.car import LiveCar
 from avtorch.live.watch_source import line_of
 from avtorch.vehicle.glvd import glvd_rollout
@@ -64,7 +65,7 @@ class Paced:
         self._due, self._lines = np.array([item[0] for item in due]), [item[1] for item in due]
         self.begun = 0.0
 
-    def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
+    def batches(self, stop: Event, start: int | None = None) -> Generator[Batch, None, None]:
         """As the contract of a source; a batch has arrived when its first row was due."""
         self.begun = time.monotonic()
         row = 0
@@ -124,7 +125,7 @@ def main() -> None:
     assert form is not None
     watch.warm_up(form)
     latencies, written, cpu, begun = Latencies(), Written(), time.process_time(), time.monotonic()
-    watch_source(source, watch, [written], observers=[latencies])
+    watch_source(source, watch, [written], answered=latencies.answered)
     used, took = time.process_time() - cpu, time.monotonic() - begun
     # the last windows are closed early, at the end
     seconds = np.array(latencies.seconds[: -given.cars])

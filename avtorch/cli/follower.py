@@ -44,7 +44,6 @@ def follow(
     `source`: keywords of `read_following`.
     """
     from avtorch.follower import diagnose_follower
-    from avtorch.follower.words import loop_lines
     from avtorch.gap.result.diagnosis import DIAGNOSIS_FILES
     from avtorch.io import answer_set, check, read_following, write_json
     from avtorch.remedy import write_exports
@@ -58,7 +57,7 @@ def follow(
     gap = found.diagnosis
     assert gap is not None
     gap = replace(gap, notes=(*gap.notes, *found.conditional))
-    lines = loop_lines(found)
+    lines = found.sentences()
     answer = replace(found, diagnosis=gap).to_dict()
     with answer_set(out, (*DIAGNOSIS_FILES, *PEDAL_FILES)) as staged:
         written = [*gap.write(staged), *write_exports(gap.plant, staged)]

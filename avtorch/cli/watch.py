@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Group, Parameter
@@ -33,7 +34,7 @@ from avtorch.cli.talk import Talk
 from avtorch.errors import InputError, quoted
 
 if TYPE_CHECKING:
-    from avtorch.live import Counts, KeptCars, LineParser, LiveWatch, Sink, Source, Stop
+    from avtorch.live import Counts, KeptCars, LineParser, LiveWatch, Sink, Source
 
 SOURCE = Group("Source", sort_key=7)
 
@@ -127,7 +128,7 @@ def watch(
     if state is not None:
         free_folder(state)
 
-    from avtorch.live import Counts, KeptCars, LineParser, LiveSettings, LiveWatch, Metrics, Stop, watch_source
+    from avtorch.live import Counts, KeptCars, LineParser, LiveSettings, LiveWatch, Metrics, watch_source
 
     settings = LiveSettings(
         window=window,
@@ -141,7 +142,7 @@ def watch(
         cars=cars,
         seed=seed,
     )
-    talk, counts, stop = Talk(json=False, quiet=quiet), Counts(), Stop()
+    talk, counts, stop = Talk(json=False, quiet=quiet), Counts(), Event()
     monitor = LiveWatch(settings, counts)
     parser = LineParser(counts, map=map, unit=unit, car=car or "car")
     with ExitStack() as open_:
@@ -153,16 +154,16 @@ def watch(
         kept = None if state is None else KeptCars(state, rows.identity)
         sink = _sink(out, kept, stop, source)
         open_.callback(sink.close)
-        observers = []
+        answered = None
         if address is not None:
             metrics = Metrics(monitor)
             port = metrics.start(*address)
             open_.callback(metrics.close)
-            observers.append(metrics)
+            answered = metrics.answered
             talk.err.print(f"Metrics: http://{address[0]}:{port}/metrics", highlight=False)
         with stopped_by_signals(stop):
             try:
-                watch_source(rows, monitor, [sink], stop=stop, kept=kept, observers=observers)
+                watch_source(rows, monitor, [sink], stop=stop, kept=kept, answered=answered)
             finally:
                 # nothing is told of a watch that was refused before its first row
                 begun = counts.rows or counts.refused or sys.exc_info()[0] is None
@@ -208,7 +209,7 @@ def _source(
     return FileSource(source, parser, follow=follow)
 
 
-def _sink(out: str | None, kept: KeptCars | None, stop: Stop, source: str) -> Sink:
+def _sink(out: str | None, kept: KeptCars | None, stop: Event, source: str) -> Sink:
     from avtorch.live import FileSink, LineSink, MqttAddress, MqttSink
     from avtorch.live.mqtt import is_mqtt
 
@@ -239,7 +240,7 @@ def host_and_port(text: str) -> tuple[str, int]:
 
 
 @contextmanager
-def stopped_by_signals(stop: Stop) -> Iterator[None]:
+def stopped_by_signals(stop: Event) -> Iterator[None]:
     """Within it the first Ctrl-C or SIGTERM sets `stop`, so that no window is left half done; a second interrupts."""
     before = {}
 

@@ -13,16 +13,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from avtorch.errors import InputError, quoted
-from avtorch.fleet.log_list import INSTALL, one_line
-
-ATTEMPTS = 3
-"""Workers of a local cluster that may end under a task before it is tried alone, and then before it is given up."""
+from avtorch.fleet.log_list import one_line
 
 CONNECT_S = 20.0
 """Time for a scheduler to answer, and for it to have a worker [s]."""
 
 _LOCAL = {
-    "distributed.scheduler.allowed-failures": ATTEMPTS - 1,
+    "distributed.scheduler.allowed-failures": 2,
+    # a process starts within ten seconds, also on a busy machine
+    "distributed.scheduler.no-workers-timeout": "60s",
     # a row is small: nothing is worth spilling, and a paused worker would never go on
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
@@ -39,24 +38,17 @@ _LOCAL = {
 
 @dataclass(frozen=True)
 class Cluster:
-    """A connected `client`; `local`: its workers are on this machine and see its disk; `dashboard`: its address."""
+    """A connected `client`, and the address of its `dashboard`."""
 
     client: Any
-    local: bool
     dashboard: str | None
-    limit: str
-
-    @property
-    def threads(self) -> int:
-        """Of all workers now; 1 at least, so that a cluster without workers is waited for."""
-        return max(1, sum(self.client.nthreads().values()))
 
 
 def require_dask() -> None:
     """Raises `InputError` saying what to install where Dask is not there; loads nothing."""
     for name in ("dask", "distributed"):
         if importlib.util.find_spec(name) is None:
-            raise InputError(f"a fleet needs {name}, which is not installed: {INSTALL}")
+            raise InputError(f"a fleet needs {name}, which is not installed: pip install 'avtorch[fleet]'")
 
 
 def memory_bytes(text: str) -> int:
@@ -104,7 +96,7 @@ def _local(workers: int, memory: str) -> Iterator[Cluster]:
             preload=["avtorch.fleet.cluster"],
         )
         with cluster, Client(cluster) as client:
-            yield Cluster(client, True, cluster.dashboard_link if shown else None, memory)
+            yield Cluster(client, cluster.dashboard_link if shown else None)
 
 
 @contextmanager
@@ -127,26 +119,21 @@ def _existing(scheduler: str) -> Iterator[Cluster]:
             ) from None
         versions: Any = client.run(_version, on_error="return")
         for worker, version in versions.items():
+            if isinstance(version, BaseException):
+                raise InputError(f"scheduler: worker {worker} has no avtorch ({one_line(version)})")
             if version != __version__:
-                found = (
-                    f"no avtorch ({one_line(version)})" if isinstance(version, BaseException) else f"avtorch {version}"
-                )
-                raise InputError(f"scheduler: worker {worker} has {found}, needs avtorch {__version__}")
-        yield Cluster(client, False, _dashboard(client), "its limit of memory")
+                raise InputError(f"scheduler: worker {worker} has avtorch {version}, needs avtorch {__version__}")
+        try:
+            link = client.dashboard_link
+        except Exception:  # a scheduler without a server for it
+            link = None
+        yield Cluster(client, link or None)
 
 
 def _version() -> str:
     from avtorch.version import __version__
 
     return __version__
-
-
-def _dashboard(client: Any) -> str | None:
-    try:
-        link = client.dashboard_link
-    except Exception:  # a scheduler without a server for it
-        return None
-    return link or None
 
 
 @contextmanager

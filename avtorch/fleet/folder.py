@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import io
-import json
+import math
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from avtorch.errors import InputError, quoted
-from avtorch.fleet.log_list import KEY, LABEL, STATUS, FleetLog, marks_of
+from avtorch.fleet.log_list import KEY, FleetLog, key_of
 from avtorch.fleet.settings import STEPS, FleetSettings, Step
 from avtorch.io import atomic, fingerprint
 from avtorch.version import __version__
 
 if TYPE_CHECKING:
-    import os
-
     import pyarrow as pa
 
     from avtorch.decision.estimation import Estimates
@@ -36,6 +33,8 @@ DATASETS: dict[Step, str] = {"check": "checks", "estimate": "windows", "diagnose
 
 Row = dict[str, Any]
 
+INTERVAL, STATS = ("mean", "q05", "q95"), ("mean", "sd", "q05", "q95")
+
 
 def schema(step: Step) -> pa.Schema:
     """The columns of a dataset; those of all datasets come first."""
@@ -44,14 +43,11 @@ def schema(step: Step) -> pa.Schema:
     text, number, whole, flag = pa.string(), pa.float64(), pa.int64(), pa.bool_()
     texts = pa.list_(text)
 
-    def interval(name: str) -> list[tuple[str, pa.DataType]]:
-        return [(f"{name}_{part}", number) for part in ("mean", "q05", "q95")]
+    def numbers(name: str, parts: Sequence[str] = STATS) -> list[tuple[str, pa.DataType]]:
+        return [(f"{name}_{part}", number) for part in parts]
 
-    def quantity(name: str) -> list[tuple[str, pa.DataType]]:
-        return [(f"{name}_{part}", number) for part in ("mean", "sd", "q05", "q95")]
-
-    named = pa.list_(pa.struct([("name", text), *quantity("value")]))
-    cause = [("name", text), ("probability", number), *interval("share"), ("alias_set", texts)]
+    named = pa.list_(pa.struct([("name", text), *numbers("value")]))
+    cause = [("name", text), ("probability", number), *numbers("share", INTERVAL), ("alias_set", texts)]
     cause += [("onset_s", number), ("plausible", flag), ("parameters", named)]
     chance = [("name", text), ("probability", number), ("share_of_noise", number)]
     own: dict[Step, list[tuple[str, pa.DataType]]] = {
@@ -62,16 +58,16 @@ def schema(step: Step) -> pa.Schema:
         ],
         "estimate": [
             *(("window", whole), ("begin_s", number), ("end_s", number), ("rows", whole)),
-            *(("excited", flag), ("used", flag), *quantity("T_L"), *quantity("K_L"), ("noise", named)),
+            *(("excited", flag), ("used", flag), *numbers("T_L"), *numbers("K_L"), ("noise", named)),
             *(("p_string_stable", number), ("alerts", texts)),
             *(("form", text), ("estimator", text), ("dead_time_s", number), ("note", text)),
         ],
         "diagnose": [
             *(("verdict", texts), ("probability", number), ("alias_set", texts), ("abstained", flag)),
             *(("causes", pa.list_(pa.struct(cause))), ("chance", pa.list_(pa.struct(chance)))),
-            *(*interval("unexplained"), ("unexplained_material", flag), ("gap_detected", flag)),
+            *(*numbers("unexplained", INTERVAL), ("unexplained_material", flag), ("gap_detected", flag)),
             *(("gap_before", number), ("gap_left", number), ("rmse_accel_mps2", number), ("rmse_speed_mps", number)),
-            *(*quantity("T_L"), *quantity("K_L"), ("complete", flag), ("summary", text), ("notes", texts)),
+            *(*numbers("T_L"), *numbers("K_L"), ("complete", flag), ("summary", text), ("notes", texts)),
             ("answer", text),
         ],
     }
@@ -104,7 +100,7 @@ def window_rows(found: Estimates, note: str | None) -> list[Row]:
         noise = entry.get("noise") or {"sigma": entry["sigma"]}
         row = {"window": number, "begin_s": entry["start_s"], "end_s": entry["end_s"], "rows": entry["n"]}
         row |= {key: entry[key] for key in ("excited", "used", "alerts", "p_string_stable")}
-        row |= _quantity("T_L", entry["T_L"]) | _quantity("K_L", entry["K_L"])
+        row |= _numbers("T_L", entry["T_L"]) | _numbers("K_L", entry["K_L"])
         rows.append(row | {"noise": _named(noise)} | of_log)
     return rows
 
@@ -123,16 +119,14 @@ def diagnosis_rows(found: Diagnosis, note: str | None) -> list[Row]:
     repaired = found.baseline if found.budget is None else found.budget.repaired
     for name in ("T_L", "K_L"):
         if name in repaired:
-            row |= _quantity(name, repaired[name].to_dict())
+            row |= _numbers(name, repaired[name].to_dict())
     if budget is None:
-        single = [
-            e for e in answer["effects"] if verdict["names"] == [e["name"]] and e["name"] not in ("none", "unknown")
-        ]
-        row["causes"] = [_cause(part) for part in single]
+        named = [name for name in verdict["names"] if name not in ("none", "unknown")]
+        row["causes"] = [_cause(effect) for effect in answer["effects"] if named == [effect["name"]]]
         return [row]
     unexplained = budget["unexplained"]
     row |= {"gap_before": budget["before"], "gap_left": budget["left"]}
-    row |= {"unexplained_material": unexplained["material"], **_interval("unexplained", unexplained["share"])}
+    row |= {"unexplained_material": unexplained["material"], **_numbers("unexplained", unexplained["share"], INTERVAL)}
     row["causes"] = [_cause({"name": part["names"][0], **part}) for part in budget["parts"]]
     kept = ("probability", "share_of_noise")
     row["chance"] = [{"name": part["names"][0], **{key: part[key] for key in kept}} for part in budget["chance"]]
@@ -140,22 +134,51 @@ def diagnosis_rows(found: Diagnosis, note: str | None) -> list[Row]:
 
 
 def _cause(part: Mapping[str, Any]) -> Row:
-    share = part.get("share") or {}
     row = {key: part.get(key) for key in ("name", "probability", "onset_s", "plausible")}
     row |= {"alias_set": list(part.get("alias_set") or ()), "parameters": _named(part["parameters"])}
-    return row | _interval("share", share)
+    return row | _numbers("share", part.get("share") or {}, INTERVAL)
 
 
-def _interval(name: str, share: Mapping[str, float]) -> Row:
-    return {f"{name}_{part}": share.get(part) for part in ("mean", "q05", "q95")}
-
-
-def _quantity(name: str, stats: Mapping[str, float]) -> Row:
-    return {f"{name}_{part}": stats.get(part) for part in ("mean", "sd", "q05", "q95")}
+def _numbers(name: str, stats: Mapping[str, float], parts: Sequence[str] = STATS) -> Row:
+    return {f"{name}_{part}": stats.get(part) for part in parts}
 
 
 def _named(stats: Mapping[str, Mapping[str, float]]) -> list[Row]:
-    return [{"name": name, **_quantity("value", values)} for name, values in stats.items()]
+    return [{"name": name, **_numbers("value", values)} for name, values in stats.items()]
+
+
+QUANTITIES = ("T_L", "K_L")
+
+Drive = Mapping[str, tuple[float, float]]
+"""What a drive says: mean and standard deviation of the coordinate of each quantity."""
+
+LEAST_SD = 1e-3
+"""Of a coordinate: no drive tells a lag or the size of an effect better than to a thousandth."""
+
+
+def drive_belief(used: Sequence[Row]) -> Drive | None:
+    """What the used windows of a drive say of log T_L and log K_L; None where an estimator gives no SD.
+
+    The standard deviation of their mean is by what the windows differ by, or by what their posteriors say, whichever is
+    more. What windows of a drive have in common is the spread from drive to drive.
+    """
+    found = {}
+    for name in QUANTITIES:
+        means, variances = [], []
+        for row in used:
+            mean, sd = row[f"{name}_mean"], row[f"{name}_sd"]
+            if mean is None or sd is None or not (math.isfinite(mean) and math.isfinite(sd) and mean > 0):
+                return None
+            variances.append(math.log1p((sd / mean) ** 2))
+            means.append(math.log(mean) - variances[-1] / 2)
+        count = len(means)
+        if not count:
+            return None
+        mean = sum(means) / count
+        spread = sum((x - mean) ** 2 for x in means) / max(1, count - 1)
+        variance = max(spread, sum(variances) / count) / count
+        found[name] = (mean, max(math.sqrt(variance), LEAST_SD))
+    return found
 
 
 def failure_rows(status: Status, why: str) -> list[Row]:
@@ -163,66 +186,45 @@ def failure_rows(status: Status, why: str) -> list[Row]:
     return [{"status": status, "error": why}]
 
 
-def labelled(rows: Sequence[Row], label: Mapping[str, Any]) -> list[Row]:
-    """Rows with what is known of their log; those without a status are done."""
-    return [{"status": "done", **row, **label} for row in rows]
-
-
-REPORTS = "reports"
-"""Below it, the reports of diagnosed logs."""
-
-
 def task_key(step: Step, sha256: str | None, settings: FleetSettings) -> str:
     """What rows were computed from: the log's content, the settings of the step, and avtorch's version."""
     return fingerprint("avtorch.fleet/1", step, sha256, settings.of(step), __version__)
 
 
-def label_of(log: FleetLog) -> dict[str, Any]:
+def _label(log: FleetLog) -> Row:
     """What is known of a log beside its content."""
     return {"car": log.car, "log": log.shown, "date": log.date, "tags": dict(log.tags)}
 
 
 @dataclass(frozen=True)
 class FleetFolder:
-    """Files below `root`: `checks`, `windows`, `diagnoses`, each appears whole or not at all."""
+    """Files below `root`: `checks`, `windows`, `diagnoses`, `reports`, each appears whole or not at all."""
 
     root: Path
 
     def path(self, step: Step, log: FleetLog) -> Path:
         """Where the rows of a log are."""
-        return self.root / DATASETS[step] / log.file_name
+        return self.root / DATASETS[step] / f"{log.name}.parquet"
 
     def report(self, log: FleetLog) -> Path:
-        """Where the report of a log is, if one was written: `reports/CAR/LOG/report.html`."""
-        return self._report(log.car, log)
-
-    def _report(self, car: str, log: FleetLog) -> Path:
-        name = re.sub(r"[^A-Za-z0-9_.-]+", "_", car)[:60].strip(".") or "car"
-        return self.root / REPORTS / name / log.file_name.removesuffix(".parquet") / "report.html"
+        """Where the report of a log is, if one was written: `reports/LOG.html`."""
+        return self.root / "reports" / f"{log.name}.html"
 
     def kept(self, step: Step, log: FleetLog, key: str) -> Status | None:
         """The status of rows that an earlier call computed from the same, None where there are none.
 
         Where the manifest names another car, date or tag since, they are written anew with these.
         """
-        written = marks_of(self.path(step, log))
-        if written.get(KEY) != key.encode() or STATUS not in written:
+        label = _label(log)
+        if key_of(self.path(step, log)) != key.encode() or not (rows := self.rows(step, log, ["status", *label])):
             return None
-        status: Any = written[STATUS].decode()
-        if written.get(LABEL) != _text(label_of(log)):
-            rows = self.rows(step, log)
-            if not rows:
-                return None
-            before, now = self._report(rows[0]["car"], log), self.report(log)
-            if step == "diagnose" and before != now and before.is_file():
-                now.parent.mkdir(parents=True, exist_ok=True)
-                before.replace(now)
-            self._write(step, log, key, [row | label_of(log) for row in rows], status)
-        return status
+        if {name: rows[0][name] for name in label} != label:
+            self._write(step, log, key, [row | label for row in self.rows(step, log)])
+        return rows[0]["status"]
 
     def has_answer(self, step: Step, log: FleetLog) -> bool:
         """Whether there are rows of an answer, from whatever content and settings."""
-        return marks_of(self.path(step, log)).get(STATUS) == b"done"
+        return {"status": "done"} in self.rows(step, log, ["status"])
 
     def write(
         self,
@@ -237,35 +239,27 @@ class FleetFolder:
     ) -> Status:
         """Write the rows of a log in place of earlier ones, with the `report` of a diagnosis; returns their status.
 
-        Raises `InputError` where that cannot be done.
+        Rows without a status are done. Raises `InputError` where that cannot be done.
         """
-        known = label_of(log) | {"sha256": sha256, "version": __version__, "seconds": seconds}
-        full = labelled(rows, known)
-        status: Status = full[0]["status"]
-        if step == "diagnose":
-            self._write_report(log, report)
-        self._write(step, log, key, full, status)
-        return status
-
-    def _write_report(self, log: FleetLog, report: str | None) -> None:
-        """In place of an earlier one, which was of another answer."""
-        if report is None:
+        known = _label(log) | {"sha256": sha256, "version": __version__, "seconds": seconds}
+        full = [{"status": "done", **row, **known} for row in rows]
+        if report is not None:
+            with atomic(self.report(log)) as stream:
+                stream.write(report)
+        elif step == "diagnose":  # an earlier one is of another answer
             self.report(log).unlink(missing_ok=True)
-            return
-        self.report(log).parent.mkdir(parents=True, exist_ok=True)
-        with atomic(self.report(log)) as stream:
-            stream.write(report)
+        self._write(step, log, key, full)
+        return full[0]["status"]
 
-    def _write(self, step: Step, log: FleetLog, key: str, rows: list[Row], status: Status) -> None:
+    def _write(self, step: Step, log: FleetLog, key: str, rows: list[Row]) -> None:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
         for row in rows:
-            row["tags"] = list(dict(row["tags"] or {}).items())
-        about = {KEY: key.encode(), LABEL: _text(label_of(log)), STATUS: status.encode()}
-        table = pa.Table.from_pylist(rows, schema=schema(step)).replace_schema_metadata(about)
+            row["tags"] = list(row["tags"].items())
         buffer = io.BytesIO()
-        pq.write_table(table, buffer)
+        table = pa.Table.from_pylist(rows, schema=schema(step))
+        pq.write_table(table.replace_schema_metadata({KEY: key.encode()}), buffer)
         with atomic(self.path(step, log), binary=True) as stream:
             stream.write(buffer.getvalue())
 
@@ -275,19 +269,15 @@ class FleetFolder:
         import pyarrow.parquet as pq
 
         try:
-            return pq.ParquetFile(self.path(step, log)).read(columns=columns).to_pylist()
+            table = pq.ParquetFile(self.path(step, log)).read(columns=columns)
         except (OSError, pa.ArrowException):
             return []
+        return table.to_pylist(maps_as_pydicts="strict")
 
     def others(self, logs: list[FleetLog]) -> int:
         """Number of logs with rows here that are not among `logs`."""
-        names = {log.file_name for log in logs}
-        there = {p.name for step in STEPS for p in (self.root / DATASETS[step]).glob("*.parquet")}
-        return len(there - names)
-
-
-def _text(label: Mapping[str, Any]) -> bytes:
-    return json.dumps(label, sort_keys=True).encode()
+        there = {p.stem for step in STEPS for p in (self.root / DATASETS[step]).glob("*.parquet")}
+        return len(there - {log.name for log in logs})
 
 
 def read_rows(out: str | os.PathLike[str], dataset: str) -> pa.Table:

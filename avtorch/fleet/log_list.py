@@ -8,17 +8,16 @@ from __future__ import annotations
 import csv
 import glob
 import hashlib
-import importlib.util
 import io
 import os
 import re
-import stat
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
+from itertools import takewhile
 from pathlib import Path, PurePath
 from typing import Any, Literal
 
@@ -26,30 +25,23 @@ from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.answer_set import is_of_answer
 from avtorch.io.formats import is_recording
 from avtorch.io.mapping import mapping_beside, mapping_place
-from avtorch.io.opening import TooLarge, kind_of, place, read_regular
+from avtorch.io.opening import opened, place, read_regular
 
-INSTALL = "pip install 'avtorch[fleet]'"
 _CAN = (".blf", ".asc", ".log")
 """Suffixes of logs that a database beside them decodes."""
 
+KEY = b"avtorch.key"
 
-KEY, LABEL, STATUS = b"avtorch.key", b"avtorch.label", b"avtorch.status"
 
-
-def marks_of(path: str | os.PathLike[str]) -> dict[bytes, bytes]:
-    """The marks of a Parquet file; none where it is missing, damaged, or not of a fleet."""
+def key_of(path: str | os.PathLike[str]) -> bytes | None:
+    """The key of a Parquet file of a fleet's rows; None where it is missing, damaged, or of something else."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        return pq.read_schema(path).metadata or {}
+        return (pq.read_schema(path).metadata or {}).get(KEY)
     except (OSError, ValueError, pa.ArrowException):
-        return {}
-
-
-def is_rows(path: str | os.PathLike[str]) -> bool:
-    """Whether a Parquet file holds rows of a fleet, and no log."""
-    return KEY in marks_of(path)
+        return None
 
 
 def is_url(text: str) -> bool:
@@ -57,21 +49,17 @@ def is_url(text: str) -> bool:
     return "://" in text
 
 
-def file_system(url: str) -> tuple[Any, str]:
-    """The file system of a URL, and the path in it. Raises `InputError` where it cannot be reached."""
-    if importlib.util.find_spec("fsspec") is None:
-        raise InputError(f"{place(url)}: is a URL; reading it needs fsspec: {INSTALL}")
-    from fsspec.core import url_to_fs
-
+@contextmanager
+def _store(url: str) -> Iterator[tuple[Any, str]]:
+    """The file system of a URL, and the path in it; what it raises within becomes an `InputError`."""
     try:
-        return url_to_fs(url)
+        from fsspec.core import url_to_fs
+
+        yield url_to_fs(url)
+    except FileNotFoundError:
+        raise InputError(f"{place(url)}: no such file") from None
     except Exception as fault:  # each store has errors of its own, a missing package among them
         raise InputError(f"{place(url)}: cannot be reached ({one_line(fault)})") from None
-
-
-def url_of(files: Any, path: str) -> str:
-    """The URL of a path in a file system, as `file_system` takes it."""
-    return str(files.unstrip_protocol(path))
 
 
 @contextmanager
@@ -84,18 +72,13 @@ def fetched(log: str) -> Iterator[Path]:
     if not is_url(log):
         yield Path(log)
         return
-    files, path = file_system(log)
     with tempfile.TemporaryDirectory(prefix="avtorch-") as folder:
-        local = Path(folder) / (Path(path).name or "log")
-        try:
+        with _store(log) as (files, path):
+            local = Path(folder) / (Path(path).name or "log")
             files.get_file(path, str(local))
             mapping = mapping_place(Path(path))
             if mapping.name != local.name and files.exists(str(mapping)):
                 files.get_file(str(mapping), str(local.with_name(mapping.name)))
-        except FileNotFoundError:
-            raise InputError(f"{place(log)}: no such file") from None
-        except Exception as fault:
-            raise InputError(f"{place(log)}: cannot be fetched ({one_line(fault)})") from None
         yield local
 
 
@@ -105,31 +88,21 @@ def content_hash(log: Path) -> tuple[str, int]:
     That is the mapping beside it, the files that it names, and the databases beside a CAN log. Raises `InputError` for
     what is no regular file, or folder of such files.
     """
-    try:
-        own = sorted(p for p in log.rglob("*") if p.is_file()) if log.is_dir() else [log]
-        files = (*own, *_beside(log))
-    except InputError:
-        raise
-    except (OSError, ValueError) as fault:  # a name too long or with a null, a folder that is closed
-        raise InputError(f"{place(log)}: cannot be read ({_why(fault)})") from None
-    state, size = hashlib.sha256(), 0
-    for number, file in enumerate(files):
-        try:
-            info = os.stat(file)
-            if not stat.S_ISREG(info.st_mode):  # opening a pipe would wait for its writer
-                raise InputError(f"{place(file)}: is {kind_of(info.st_mode)}; a log is needed")
-            with file.open("rb") as stream:
-                digest = hashlib.file_digest(stream, "sha256")
-        except FileNotFoundError:
-            raise InputError(f"{place(file)}: no such file") from None
-        except InputError:
-            raise
-        except (OSError, ValueError) as fault:
-            raise InputError(f"{place(file)}: cannot be read ({_why(fault)})") from None
-        state.update(f"{file.name}:{info.st_size}:".encode("utf-8", "backslashreplace"))
-        state.update(digest.digest())
-        size += info.st_size if number < len(own) else 0
+    state = hashlib.sha256()
+    own = sorted(p for p in log.rglob("*") if p.is_file()) if os.path.isdir(log) else [log]
+    size = sum(_hashed(file, state) for file in own)
+    for file in _beside(log):
+        _hashed(file, state)
     return state.hexdigest(), size
+
+
+def _hashed(file: Path, state: Any) -> int:
+    """Feed a file's name and content to `state`; returns its bytes."""
+    with opened(file, need="a log") as stream:
+        size = os.fstat(stream.fileno()).st_size
+        state.update(f"{file.name}:{size}:".encode("utf-8", "backslashreplace"))
+        state.update(hashlib.file_digest(stream, "sha256").digest())  # pyright: ignore[reportArgumentType]
+    return size
 
 
 def _beside(log: Path) -> list[Path]:
@@ -140,19 +113,14 @@ def _beside(log: Path) -> list[Path]:
     return found
 
 
-def _why(fault: OSError | ValueError) -> str:
-    return printable(str(getattr(fault, "strerror", None) or fault), 160)
-
-
 def one_line(fault: BaseException) -> str:
     """The kind of an error and its message."""
     text = " ".join(str(fault).split())
-    return printable(f"{type(fault).__name__}: {text}" if text else type(fault).__name__, 160)
+    return printable(f"{type(fault).__name__}: {text}" if text else type(fault).__name__, 400)
 
 
 MOST = 256 * 2**20
 """Most bytes of a manifest."""
-_HEAD = 4096
 NEED = "a header such as log,car,date"
 
 
@@ -161,30 +129,20 @@ def is_manifest(source: str) -> bool:
     if not source.lower().endswith(".csv"):
         return False
     try:
-        if is_url(source):
-            with fetched(source) as local:
-                head = _head(local)
-        else:
-            head = _head(Path(source))
-    except (InputError, OSError, ValueError):
-        return False
-    try:
-        names = [name.strip().lower() for name in next(csv.reader([head], delimiter=_delimiter(head)), [])]
-    except csv.Error:
+        with fetched(source) as local, opened(local, need="a manifest") as stream:
+            head = stream.readline(4096).decode("utf-8-sig", "replace")
+        names = [name.strip().lower() for name in next(_cells(head), [])]
+    except (InputError, OSError, csv.Error):
         return False
     return "log" in names and ("car" in names or "time" not in names)
 
 
-def _delimiter(head: str) -> str:
-    """What separates the columns of a header: a comma, or the semicolon of spreadsheets where the comma is decimal."""
-    return ";" if ";" in head and "," not in head else ","
-
-
-def _head(path: Path) -> str:
-    if not path.is_file():
-        return ""
-    with path.open("rb") as stream:
-        return stream.read(_HEAD).decode("utf-8-sig", "replace").partition("\n")[0]
+def _cells(text: str) -> Any:
+    """A reader of CSV, its columns separated by a comma, or by the semicolon of spreadsheets where the comma is
+    decimal."""
+    head = text.partition("\n")[0]
+    delimiter = ";" if ";" in head and "," not in head else ","
+    return csv.reader(io.StringIO(text), delimiter=delimiter, strict=True)
 
 
 def read_manifest(source: str) -> list[FleetLog]:
@@ -195,18 +153,14 @@ def read_manifest(source: str) -> list[FleetLog]:
     """
     shown = place(source)
     with fetched(source) as local:
-        try:
-            raw = read_regular(local, most=MOST, need="a manifest")
-        except TooLarge as fault:
-            raise InputError(f"{fault}; split the fleet") from None
+        raw = read_regular(local, most=MOST, need="a manifest")
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as fault:
         line = raw.count(b"\n", 0, fault.start) + 1
         raise InputError(f"{shown}: line {line}: is not UTF-8; a manifest is a CSV file in UTF-8") from None
-    reader = csv.reader(io.StringIO(text), delimiter=_delimiter(text.partition("\n")[0]), strict=True)
-    rows: list[FleetLog] = []
-    first: dict[str, int] = {}
+    reader = _cells(text)
+    rows: dict[str, FleetLog] = {}
     try:
         names = [name.strip() for name in next(reader, [])]
         for column in ("log", "car"):
@@ -219,15 +173,15 @@ def read_manifest(source: str) -> list[FleetLog]:
                 continue
             where = f"{shown}: row {len(rows) + 1} (line {reader.line_num})"
             row = _row(source, where, names, cells)
-            if row.identity in first:
-                raise InputError(f"{where}, column log: {quoted(row.place)} is already in row {first[row.identity]}")
-            rows.append(row)
-            first[row.identity] = len(rows)
+            if row.identity in rows:
+                number = list(rows).index(row.identity) + 1
+                raise InputError(f"{where}, column log: {quoted(row.place)} is already in row {number}")
+            rows[row.identity] = row
     except csv.Error as fault:
         raise InputError(f"{shown}: line {reader.line_num}: is no CSV ({fault})") from None
     if not rows:
         raise InputError(f"{shown}: has no row below its header; needs a log in each")
-    return rows
+    return list(rows.values())
 
 
 def _row(source: str, where: str, names: list[str], cells: list[str]) -> FleetLog:
@@ -245,9 +199,10 @@ def _row(source: str, where: str, names: list[str], cells: list[str]) -> FleetLo
             raise InputError(
                 f"{where}, column date: found {quoted(date)}, needs a date such as 2026-11-23 or 2026-11-23T08:30"
             ) from None
-    if not is_url(log) and not os.path.isabs(log):
-        parent = source.rpartition("/")[0] if is_url(source) else os.path.dirname(source)
-        log = f"{parent}/{log}" if is_url(source) else os.path.normpath(os.path.join(parent, log))
+    if is_url(source) and not is_url(log) and not os.path.isabs(log):
+        log = f"{source.rpartition('/')[0]}/{log}"
+    elif not is_url(log):
+        log = os.path.normpath(os.path.join(os.path.dirname(source), log))
     return FleetLog(log, car, date or None, {key: value for key, value in entry.items() if value})
 
 
@@ -279,10 +234,10 @@ class FleetLog:
         return self.place if is_url(self.place) else os.path.abspath(self.place)
 
     @property
-    def file_name(self) -> str:
+    def name(self) -> str:
         """Of its rows: the log's own name, and a part that no other log has."""
         stem = re.sub(r"[^A-Za-z0-9_.-]+", "_", _stem(self.place))[:40].strip(".") or "log"
-        return f"{stem}-{hashlib.sha256(self.identity.encode('utf-8', 'surrogatepass')).hexdigest()[:12]}.parquet"
+        return f"{stem}-{hashlib.sha256(self.identity.encode('utf-8', 'surrogatepass')).hexdigest()[:12]}"
 
 
 @dataclass(frozen=True)
@@ -301,8 +256,9 @@ def find_logs(
     """The logs that `sources` name: files, globs (`**` for any depth), folders with all below, URLs, or one manifest.
 
     A manifest is a CSV file with the columns `log`, `car` and, if wanted, `date` and others, which become tags. Without
-    one, a log's car is its folder's name where the logs lie in several folders, else its own name. In a folder, tables
-    and recordings are taken by their suffix or first bytes, and nothing in `leave_out`, the fleet's own folder.
+    one, a log's car is its folder where the logs lie in several folders, named from below the folder that holds them
+    all, else its own name. In a folder, tables and recordings are taken by their suffix or first bytes, and nothing in
+    `leave_out`, the fleet's own folder.
 
     Raises `InputError` where a source has no log, for a manifest beside other sources, and for errors in a manifest by
     line and column.
@@ -316,86 +272,53 @@ def find_logs(
             raise InputError(f"{place(manifests[0])}: is a manifest; needs to be the only source")
         return LogList(tuple(read_manifest(manifests[0])), "manifest")
     hidden = None if leave_out is None else Path(os.path.abspath(leave_out))
-    found = dict.fromkeys(path for source in given for path in _logs_of(source, hidden))
-    seen: dict[str, str] = {}
-    for path in found:  # one log named twice, as logs/a.csv and ./logs/a.csv
-        seen.setdefault(FleetLog(path, "").identity, path)
-    return _named(list(seen.values()))
+    found: dict[str, str] = {}
+    for source in given:
+        for path in _logs_of(source, hidden):  # one log named twice, as logs/a.csv and ./logs/a.csv
+            found.setdefault(FleetLog(path, "").identity, path)
+    return _named(list(found.values()))
 
 
-def _named(paths: Sequence[str]) -> LogList:
-    folders = {path: _parent(path) for path in paths}
+def _named(paths: list[str]) -> LogList:
+    folders = {path: PurePath(_parent(path)).parts for path in paths}
     several = len(set(folders.values())) > 1
-    cars = {path: PurePath(folders[path]).name if several else _stem(path) for path in paths}
     if several:
-        names = _apart(set(folders.values()))
-        cars = {path: names[folder] for path, folder in folders.items()}
+        shared = len(list(takewhile(lambda parts: len(set(parts)) == 1, zip(*folders.values(), strict=False))))
+        cars = {path: "/".join(parts[shared:] or parts[-1:]) for path, parts in folders.items()}
     else:
-        names = Counter(cars.values())
-        cars = {p: PurePath(p).name if names[c] > 1 else c for p, c in cars.items()}
+        count = Counter(map(_stem, paths))
+        cars = {path: PurePath(path).name if count[_stem(path)] > 1 else _stem(path) for path in paths}
     logs = tuple(FleetLog(path, printable(cars[path]) or "car") for path in paths)
     return LogList(logs, "folder" if several else "file")
 
 
-def _apart(folders: Iterable[str]) -> dict[str, str]:
-    """A name for each folder: its last part, and before it as many as tell it from others that end alike.
-
-    So fleet_a/car_1 and fleet_b/car_1 are two cars, as red/run_1/data and blue/run_1/data are.
-    """
-    alike: dict[str, list[str]] = {}
-    for folder in folders:
-        alike.setdefault(PurePath(folder).name, []).append(folder)
-    names = {}
-    for together in alike.values():
-        parts = {folder: PurePath(folder).parts for folder in together}
-        count = 1
-        while len({parts[folder][-count:] for folder in together}) < len(together):
-            count += 1
-        names |= {folder: "/".join(parts[folder][-count:]) for folder in together}
-    return names
-
-
 def _logs_of(source: str, leave_out: Path | None) -> list[str]:
     if is_url(source):
-        return _in_store(source)
-    path = Path(source)
-    if path.is_dir() and not is_recording(path):
-        found = _below(path, leave_out)
-        if not found:
-            raise InputError(
-                f"{place(source)}: no log in this folder; needs tables ({', '.join(TABLES)}) or recordings"
-            )
-        return found
-    if os.path.lexists(source):
-        return [source]
-    if glob.has_magic(source):
-        matched = sorted(glob.glob(source, recursive=True))
-        found = [log for path in matched for log in _matched(Path(path), leave_out)]
-        if found:
-            return found
-        raise InputError(f"{place(source)}: matches no log; needs a glob such as 'logs/**/*.csv'")
-    raise InputError(f"{place(source)}: no such file")
+        found = _in_store(source)
+    elif os.path.lexists(source):
+        found = _below(Path(source), leave_out)
+    elif glob.has_magic(source):
+        matched = [Path(path) for path in sorted(glob.glob(source, recursive=True))]
+        own = [p for p in matched if leave_out is None or not Path(os.path.abspath(p)).is_relative_to(leave_out)]
+        found = [log for path in own if not _is_answer(path) for log in _below(path, leave_out)]
+    else:
+        raise InputError(f"{place(source)}: no such file")
+    if not found:
+        raise InputError(f"{place(source)}: no log there; needs tables ({', '.join(TABLES)}) or recordings")
+    return found
 
 
-def _matched(path: Path, leave_out: Path | None) -> list[str]:
-    """What a glob names with one of its matches; nothing of the fleet's own folder, nor other answers."""
-    if leave_out is not None and Path(os.path.abspath(path)).is_relative_to(leave_out):
-        return []
-    if path.is_dir() and not is_recording(path):
-        return _below(path, leave_out)
-    return [] if _is_answer(path) else [str(path)]
-
-
-def _below(folder: Path, leave_out: Path | None) -> list[str]:
+def _below(path: Path, leave_out: Path | None) -> list[str]:
+    """The logs in a folder; of a file and of a recording that is a folder, itself."""
+    if not path.is_dir() or is_recording(path):
+        return [str(path)]
     found: list[str] = []
-    for root, folders, names in os.walk(folder, onerror=_closed):
+    for root, folders, names in os.walk(path, onerror=_closed):
         here = Path(root)
-        folders[:] = sorted(
-            f for f in folders if not f.startswith(".") and Path(os.path.abspath(here / f)) != leave_out
-        )
-        bags = [f for f in folders if is_recording(here / f)]
-        folders[:] = [f for f in folders if f not in bags]
-        found += [str(here / name) for name in (*bags, *sorted(names)) if name in bags or _is_log(here / name)]
+        known = sorted(f for f in folders if not f.startswith(".") and Path(os.path.abspath(here / f)) != leave_out)
+        bags = [f for f in known if is_recording(here / f)]
+        folders[:] = [f for f in known if f not in bags]
+        found += [str(here / name) for name in (*bags, *names) if name in bags or _is_log(here / name)]
     return sorted(found)
 
 
@@ -414,7 +337,7 @@ def _is_log(path: Path) -> bool:
 def _is_answer(path: Path) -> bool:
     if path.name == "manoeuvre.csv" and is_of_answer(path, "diagnosis.json"):
         return True
-    return path.suffix == ".parquet" and is_rows(path)
+    return path.suffix == ".parquet" and key_of(path) is not None
 
 
 def _is_table(name: str) -> bool:
@@ -422,19 +345,14 @@ def _is_table(name: str) -> bool:
 
 
 def _in_store(url: str) -> list[str]:
-    files, path = file_system(url)
-    try:
+    with _store(url) as (files, path):
         if glob.has_magic(path):
             found = [p for p in files.glob(path) if not files.isdir(p)]
         elif files.isdir(path):
             found = [p for p in files.find(path) if _is_table(p) or p.lower().endswith(RECORDINGS)]
         else:
             found = [path] if files.exists(path) else []
-    except Exception as fault:
-        raise InputError(f"{place(url)}: cannot be listed ({type(fault).__name__}: {fault})") from None
-    if not found:
-        raise InputError(f"{place(url)}: no log there")
-    return sorted(url_of(files, p) for p in found)
+        return sorted(str(files.unstrip_protocol(p)) for p in found)
 
 
 def _parent(path: str) -> str:

@@ -1,12 +1,9 @@
-"""The cars of a fleet beside one another: partially pooled T_L and K_L, whose a cause is, and how large it is.
+"""The cars of a fleet beside one another: partially pooled T_L and K_L, and how large a cause is.
 
 SGLD walks over mean and spreads, then each car follows in closed form. Each quantity is pooled by itself, in a
 coordinate in which cars vary normally: the logarithm of a lag or gain, or that of the prior of an effect's parameter,
 in which typical sizes have a standard deviation of one. Parameters that belong to the drive (a road, the row at which a
 gain changes) are no car's and are left out.
-
-A car has a cause where more than half of its diagnosed drives name it. Of `have` cars among `diagnosed`, the share of
-all such cars has the belief Beta(have + 1/2, diagnosed - have + 1/2), from Jeffreys' prior.
 """
 
 from __future__ import annotations
@@ -14,16 +11,16 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from avtorch.fleet.folder import Row
+import torch
+from torch import Tensor
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from avtorch.gap.simulator.parameter import Parameter
-    from avtorch.inference.population import PopulationMargin
-
+from avtorch.fleet.folder import LEAST_SD, QUANTITIES, Drive
+from avtorch.gap import EFFECTS
+from avtorch.gap.simulator.parameter import Parameter
+from avtorch.inference import SamplerSettings, sample
+from avtorch.inference.population import MEAN_SD, SPREAD, PopulationMargin
 
 FEWEST = 3
 """Cars from which there are siblings to compare with."""
@@ -34,15 +31,12 @@ SAMPLED = 200
 Z_90 = 1.6448536269514722
 """Standard deviations from a normal's mean to its 5 and 95 % quantiles."""
 
-Drive = Mapping[str, tuple[float, float]]
-"""What a drive says: mean and standard deviation of the coordinate of each quantity."""
-
 
 class Pooling:
     """The `quantities` of `cars`, each with one drive or more; all cars, numbered in order, are those of `names`.
 
-    `spread`: what cars are expected to differ by, None: as much as lags do. `margin` is the density over all of them,
-    `mean` (draw, quantity) the draws of the mean over cars.
+    `spread`: what cars are expected to differ by. `margin` is the density over all of them, `mean` (draw, quantity) the
+    draws of the mean over cars.
     """
 
     def __init__(
@@ -51,12 +45,8 @@ class Pooling:
         quantities: Sequence[str],
         seed: int = 0,
         *,
-        spread: float | None = None,
+        spread: float = SPREAD,
     ) -> None:
-        import torch
-
-        from avtorch.inference import SamplerSettings, sample
-
         self.names = [name for name, drives in cars.items() if drives]
         self.drives = sum(len(cars[name]) for name in self.names)
         self.margin = _margin(cars, self.names, quantities, spread)
@@ -81,16 +71,12 @@ class Pooling:
 
     def next_car(self, i: int, seed: int = 0) -> Tensor:
         """Draws (draw,) of quantity `i` of a car of the model that was not driven."""
-        import torch
-
         draws = self._posterior.flat[:, i]
         noise = torch.randn(len(draws), generator=torch.Generator().manual_seed(seed), dtype=draws.dtype)
         return draws[:, 0] + draws[:, 1] * noise
 
     def each_car(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation (quantity, car) of every car, given its own drives and its siblings'."""
-        import torch
-
         draws = self._posterior.flat[::16]
         z = torch.cat([draws[..., :1], draws[..., 1:].log()], -1)
         if self.margin.repeated and not self._repeated:
@@ -111,61 +97,20 @@ def interval(draws: Tensor) -> dict[str, float]:
 
 
 def _margin(
-    cars: Mapping[str, Sequence[Drive]], names: Sequence[str], quantities: Sequence[str], spread: float | None
+    cars: Mapping[str, Sequence[Drive]], names: Sequence[str], quantities: Sequence[str], spread: float
 ) -> PopulationMargin:
-    import torch
-
-    from avtorch.inference.population import SPREAD, PopulationMargin
-
     drives = [(number, drive) for number, name in enumerate(names) for drive in cars[name]]
     values, sd = (
         torch.tensor([[drive[q][part] for _, drive in drives] for q in quantities], dtype=torch.float64)
         for part in (0, 1)
     )
-    number = torch.tensor([number for number, _ in drives])
-    return PopulationMargin(values, sd, number, spread=SPREAD if spread is None else spread)
-
-
-QUANTITIES = ("T_L", "K_L")
-
-APART = 0.05
-"""Expected share of false ones among the cars that are said to differ from their siblings."""
-
-_LEAST_SD = 1e-3
-"""Of a coordinate: no drive tells a lag or the size of an effect better than to a thousandth."""
-
-
-def drive_belief(used: Sequence[Row]) -> Drive | None:
-    """What the used windows of a drive say of log T_L and log K_L; None where an estimator gives no SD.
-
-    The standard deviation of their mean is by what the windows differ by, or by what their posteriors say, whichever is
-    more. What windows of a drive have in common is the spread from drive to drive.
-    """
-    found = {}
-    for name in QUANTITIES:
-        means, variances = [], []
-        for row in used:
-            mean, sd = row[f"{name}_mean"], row[f"{name}_sd"]
-            if mean is None or sd is None or not (math.isfinite(mean) and math.isfinite(sd) and mean > 0):
-                return None
-            variances.append(math.log1p((sd / mean) ** 2))
-            means.append(math.log(mean) - variances[-1] / 2)
-        count = len(means)
-        if not count:
-            return None
-        mean = sum(means) / count
-        spread = sum((x - mean) ** 2 for x in means) / max(1, count - 1)
-        variance = max(spread, sum(variances) / count) / count
-        found[name] = (mean, max(math.sqrt(variance), _LEAST_SD))
-    return found
+    return PopulationMargin(values, sd, torch.tensor([number for number, _ in drives]), spread=spread)
 
 
 def population(cars: Mapping[str, Sequence[Drive]], seed: int = 0) -> tuple[dict[str, Any] | None, dict[str, Any]]:
     """What is common to the cars, and each car beside its siblings, by name; None and nothing below `FEWEST` cars."""
     if sum(bool(drives) for drives in cars.values()) < FEWEST:
         return None, {}
-    from avtorch.fleet.siblings import left_out
-
     pooling = Pooling(cars, QUANTITIES, seed)
     common: dict[str, Any] = {
         "cars": len(pooling.names),
@@ -205,52 +150,74 @@ def _q_values(p: Sequence[float]) -> list[float]:
     return found
 
 
-COMMON, SINGLE = 2 / 3, 1 / 3
-"""The model's: the 90 % interval of the share of cars is above the first. Single cars': below the second."""
+GRID = (32, 24)
+"""Points of the grid over the spread between cars, and over that between drives."""
 
-VERDICTS = ("the model's", "single cars'", "not decided")
+NARROWINGS = 3
+"""Times that the grid is drawn in to where some car's belief is."""
 
-Diagnosed = Mapping[str, Any]
-"""A drive's `named` causes, and those `alike`, which its log cannot tell from them."""
+WIDEST = (math.log(1e-3), math.log(4.0))
+"""Of the logarithm of a spread."""
 
-
-def car_causes(drives: Sequence[Diagnosed]) -> tuple[list[str], list[str]]:
-    """The causes that a car has by most of its drives, and those that it may have instead of them."""
-    return _mostly(drives, "named"), _mostly(drives, "alike")
-
-
-def _mostly(drives: Sequence[Diagnosed], key: str) -> list[str]:
-    names = {name for drive in drives for name in drive[key]}
-    return sorted(name for name in names if 2 * sum(name in drive[key] for drive in drives) > len(drives))
+_OUTSIDE = 1e-9
+"""Share of a belief that a grid that is drawn in may leave outside at either end."""
 
 
-def fleet_causes(cars: Mapping[str, tuple[Sequence[str], Sequence[str]]]) -> list[dict[str, Any]]:
-    """The causes that some car has, the most common first: how many cars, the share's interval, and whose it is.
+def left_out(margin: PopulationMargin) -> tuple[Tensor, Tensor]:
+    """Of each car what its siblings predict, and the two-sided tail probability of its own drives under it.
 
-    `cars`: of each diagnosed car what `car_causes` returns. A cause is single cars' only if those that may have it in
-    place of another are few as well.
+    Both `(quantity, car)`; the prediction is the mean of the logarithm. The mean over cars has a normal belief in
+    closed form once the spreads are given, so each car is left out exactly, at every point of a grid over the spreads:
+    a car that counted among those that tell the spread would widen it and so hide itself.
     """
-    count = len(cars)
-    found = []
-    for name in sorted({n for named, _ in cars.values() for n in named}):
-        have = [car for car, (named, _) in cars.items() if name in named]
-        may = sum(name in {*named, *alike} for named, alike in cars.values())
-        share, most = _share(len(have), count), _share(may, count)
-        verdict = "not decided"
-        if share["q05"] > COMMON:
-            verdict = "the model's"
-        elif most["q95"] < SINGLE:
-            verdict = "single cars'"
-        one: dict[str, Any] = {"name": name, "cars": len(have), "may": may, "diagnosed": count, "share": share}
-        found.append(one | {"verdict": verdict, "of": have if verdict == "single cars'" else None})
-    return sorted(found, key=lambda one: (-one["cars"], one["name"]))
+    found = [_left_out(margin.select(torch.tensor([i]))) for i in range(margin.windows)]
+    return torch.stack([mean for mean, _ in found]), torch.stack([tail for _, tail in found])
 
 
-def _share(have: int, count: int) -> dict[str, float]:
-    from scipy.special import betaincinv
+def _left_out(margin: PopulationMargin) -> tuple[Tensor, Tensor]:
+    between, within = (torch.linspace(*WIDEST, n, dtype=torch.float64) for n in GRID)
+    if not margin.repeated:
+        within = torch.full((1,), -math.inf, dtype=torch.float64)
+    for _ in range(NARROWINGS):
+        weight, *_ = _grid(margin, between, within)
+        between = _narrowed(between, weight.sum(1))
+        within = _narrowed(within, weight.sum(0)) if margin.repeated else within
+    weight, below, centre = _grid(margin, between, within)
+    share, over = (weight * below).sum((0, 1)), (weight * (1 - below)).sum((0, 1))
+    return (weight * centre).sum((0, 1)), (2 * torch.minimum(share, over)).clamp(0.0, 1.0)
 
-    a, b = have + 0.5, count - have + 0.5
-    return {"mean": a / (a + b), "q05": float(betaincinv(a, b, 0.05)), "q95": float(betaincinv(a, b, 0.95))}
+
+def _grid(margin: PopulationMargin, between: Tensor, within: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`(between, within, car)`: belief in each point without the car, probability of an estimate below its own, and the
+    mean over the other cars."""
+    log_weight, below, centres = [], [], []
+    for spread in within:
+        mean, precision, left = (x[0] for x in margin.of_cars(spread.exp()[None]))
+        variance = between.exp().square()[:, None] + 1 / precision
+        w = 1 / variance
+        # sums over all cars, less the car's own; the prior of the mean counts as one more, of mean 0
+        total, weighted, square, logs = (
+            x.sum(-1, keepdim=True) - x for x in (w, w * mean, w * mean.square(), w.log() + 2 * left)
+        )
+        total = total + 1 / MEAN_SD**2
+        centre = weighted / total
+        evidence = 0.5 * (logs - total.log() - square + weighted * centre)
+        prior = 2 * between[:, None] - 2 / SPREAD * between[:, None].exp()
+        if margin.repeated:
+            prior = prior + 2 * spread - 2 / SPREAD * spread.exp()
+        log_weight.append(evidence + prior)
+        centres.append(centre)
+        below.append(torch.special.ndtr((mean - centre) / (variance + 1 / total).sqrt()))
+    log_weight = torch.stack(log_weight, 1)
+    weight = log_weight.flatten(0, 1).softmax(0).unflatten(0, log_weight.shape[:2])
+    return weight, torch.stack(below, 1), torch.stack(centres, 1)
+
+
+def _narrowed(grid: Tensor, weight: Tensor) -> Tensor:
+    """As many points between the outermost ones that some car's belief reaches; `weight` `(point, car)`."""
+    inside = (weight.amax(1) > _OUTSIDE).nonzero().flatten()
+    low, high = max(int(inside[0]) - 1, 0), min(int(inside[-1]) + 1, len(grid) - 1)
+    return torch.linspace(float(grid[low]), float(grid[high]), len(grid), dtype=grid.dtype)
 
 
 EFFECT_SPREAD = 0.5
@@ -308,8 +275,6 @@ def effect_sizes(
 
 def _of_car(cause: str) -> list[Parameter]:
     """The parameters of an effect's answer that are the car's; none of an effect that is not registered here."""
-    from avtorch.gap import EFFECTS
-
     effect = EFFECTS.get(cause)
     if effect is None or effect.of_the_drive:
         return []
@@ -322,13 +287,11 @@ def _belief(parameter: Parameter, stats: Mapping[str, Any]) -> tuple[float, floa
     From the ends of the 90 % interval where both are possible values: the mean of a skewed belief is not the middle of
     its coordinate.
     """
-    import torch
-
     ends = [stats.get(key) for key in ("value_q05", "value_q95")]
     if all(end is not None and math.isfinite(end) for end in ends):
         low, high = (float(z) for z in parameter.unconstrain(torch.tensor(ends, dtype=torch.float64)))
         if math.isfinite(low) and math.isfinite(high):
-            return (low + high) / 2, max(abs(high - low) / (2 * Z_90), _LEAST_SD)
+            return (low + high) / 2, max(abs(high - low) / (2 * Z_90), LEAST_SD)
     mean, sd = stats["value_mean"], stats["value_sd"]
     if mean is None or sd is None or not (math.isfinite(mean) and math.isfinite(sd)):
         return None
@@ -337,10 +300,8 @@ def _belief(parameter: Parameter, stats: Mapping[str, Any]) -> tuple[float, floa
     if not bool(z.isfinite()):
         return None
     (slope,) = torch.autograd.grad(z, value)
-    return float(z.detach()), max(abs(float(slope)) * sd, _LEAST_SD)
+    return float(z.detach()), max(abs(float(slope)) * sd, LEAST_SD)
 
 
 def _value(parameter: Parameter, z: float) -> float:
-    import torch
-
     return float(parameter.constrain(torch.tensor(z, dtype=torch.float64)))

@@ -2,44 +2,34 @@
 
 A car below the target of P(string stable) comes first, then one with a log that failed, then one that differs from its
 own past, then one that differs from its siblings, then the others by the gap of their simulator.
+
+A car has a cause where more than half of its diagnosed drives name it. Of `have` cars among `diagnosed`, the share of
+all such cars has the belief Beta(have + 1/2, diagnosed - have + 1/2), from Jeffreys' prior.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from statistics import fmean, pvariance
 from typing import Any
 
-from avtorch.fleet.folder import DATASETS, FleetFolder, Row
+from avtorch.fleet.folder import DATASETS, FleetFolder, Row, drive_belief
 from avtorch.fleet.log_list import FleetLog, LogList
-from avtorch.fleet.population import (
-    APART,
-    car_causes,
-    drive_belief,
-    drive_sizes,
-    effect_sizes,
-    fleet_causes,
-    population,
-)
-from avtorch.fleet.settings import FleetSettings, Step
+from avtorch.fleet.settings import FleetSettings
 from avtorch.version import __version__
 
 SCHEMA = "avtorch.fleet/1"
+APART = 0.05
+"""Expected share of false ones among the cars that are said to differ from their siblings."""
+
 CHANGED = 3.0
 """Standard deviations between drives from which a car is said to differ from its past."""
 
 REASONS = ("below target", "failed", "changed", "unlike siblings", "gap", "sound", "no answer")
 """Why a car is where it is, in order."""
-
-_CHECK = ["status", "error"]
-_WINDOW = ["status", "error", "used", "end_s", "p_string_stable"]
-_WINDOW += [f"{name}_{part}" for name in ("T_L", "K_L") for part in ("mean", "sd", "q05", "q95")]
-_DIAGNOSIS = ["status", "error", "verdict", "causes", "gap_before", "gap_left", "gap_detected", "summary"]
-_DIAGNOSIS += ["alias_set"]
-_DIAGNOSIS += [f"unexplained_{part}" for part in ("mean", "q05", "q95", "material")]
 
 
 def fleet_answer(found: LogList, folder: FleetFolder, settings: FleetSettings) -> dict[str, Any]:
@@ -48,12 +38,19 @@ def fleet_answer(found: LogList, folder: FleetFolder, settings: FleetSettings) -
     for log in found.logs:
         of_car.setdefault(log.car, []).append(log)
     cars = [_car(car, sorted(logs, key=_when), folder, settings) for car, logs in of_car.items()]
-    common, beside = population({car["car"]: car.pop("beliefs") for car in cars}, settings.seed)
+    beliefs = {car["car"]: car.pop("beliefs") for car in cars}
+    common, beside = None, {}
+    if any(beliefs.values()):
+        from avtorch.fleet.population import population  # needs torch
+
+        common, beside = population(beliefs, settings.seed)
     diagnosed = {car["car"]: drives for car in cars if (drives := car.pop("diagnosed"))}
     has = {car: car_causes(drives) for car, drives in diagnosed.items()}
     causes = fleet_causes(has)
     sizes: dict[str, dict[str, Any]] = {}
     for cause in causes:
+        from avtorch.fleet.population import effect_sizes
+
         name = cause["name"]
         told = {car: [one["sizes"] for one in diagnosed[car]] for car, (named, _) in has.items() if name in named}
         cause["parameters"], own = effect_sizes(name, told, settings.seed)
@@ -123,9 +120,8 @@ def _log(log: FleetLog, folder: FleetFolder, settings: FleetSettings) -> dict[st
     there = "diagnose" in settings.steps and report.is_file()
     out |= {"rows": rows, "report": report.relative_to(folder.root).as_posix() if there else None}
     out |= {"actuation": None, "diagnosis": None}
-    wanted: dict[Step, list[str]] = {"check": _CHECK, "estimate": _WINDOW, "diagnose": _DIAGNOSIS}
     for step in settings.steps:
-        read = folder.rows(step, log, wanted[step])
+        read = folder.rows(step, log)
         if not read or read[0]["status"] != "done":
             out["errors"][step] = read[0]["error"] if read else "its rows are missing or damaged"
         elif step == "estimate":
@@ -174,7 +170,11 @@ def _gap(row: Row) -> dict[str, Any]:
     unexplained = {part: row[f"unexplained_{part}"] for part in ("mean", "q05", "q95", "material")}
     out = {"detected": row["gap_detected"], "before": row["gap_before"], "left": row["gap_left"]}
     out |= {"verdict": row["verdict"], "causes": causes, "summary": row["summary"], "alike": alike}
-    out["sizes"] = drive_sizes(row["causes"] or ())
+    out["sizes"] = {}
+    if row["causes"]:
+        from avtorch.fleet.population import drive_sizes
+
+        out["sizes"] = drive_sizes(row["causes"])
     return out | {"unexplained": None if unexplained["mean"] is None else unexplained}
 
 
@@ -214,3 +214,49 @@ def _when(log: FleetLog) -> tuple[bool, datetime, str]:
         return False, datetime.min.replace(tzinfo=UTC), os.path.basename(log.place)
     date = datetime.fromisoformat(log.date)
     return True, date if date.tzinfo is not None else date.replace(tzinfo=UTC), log.place
+
+
+COMMON, SINGLE = 2 / 3, 1 / 3
+"""The model's: the 90 % interval of the share of cars is above the first. Single cars': below the second."""
+
+Diagnosed = Mapping[str, Any]
+"""A drive's `named` causes, and those `alike`, which its log cannot tell from them."""
+
+
+def car_causes(drives: Sequence[Diagnosed]) -> tuple[list[str], list[str]]:
+    """The causes that a car has by most of its drives, and those that it may have instead of them."""
+    return _mostly(drives, "named"), _mostly(drives, "alike")
+
+
+def _mostly(drives: Sequence[Diagnosed], key: str) -> list[str]:
+    names = {name for drive in drives for name in drive[key]}
+    return sorted(name for name in names if 2 * sum(name in drive[key] for drive in drives) > len(drives))
+
+
+def fleet_causes(cars: Mapping[str, tuple[Sequence[str], Sequence[str]]]) -> list[dict[str, Any]]:
+    """The causes that some car has, the most common first: how many cars, the share's interval, and whose it is.
+
+    `cars`: of each diagnosed car what `car_causes` returns. A cause is single cars' only if those that may have it in
+    place of another are few as well.
+    """
+    count = len(cars)
+    found = []
+    for name in sorted({n for named, _ in cars.values() for n in named}):
+        have = [car for car, (named, _) in cars.items() if name in named]
+        may = sum(name in {*named, *alike} for named, alike in cars.values())
+        share, most = _share(len(have), count), _share(may, count)
+        verdict = "not decided"
+        if share["q05"] > COMMON:
+            verdict = "the model's"
+        elif most["q95"] < SINGLE:
+            verdict = "single cars'"
+        one: dict[str, Any] = {"name": name, "cars": len(have), "may": may, "diagnosed": count, "share": share}
+        found.append(one | {"verdict": verdict, "of": have if verdict == "single cars'" else None})
+    return sorted(found, key=lambda one: (-one["cars"], one["name"]))
+
+
+def _share(have: int, count: int) -> dict[str, float]:
+    from scipy.special import betaincinv
+
+    a, b = have + 0.5, count - have + 0.5
+    return {"mean": a / (a + b), "q05": float(betaincinv(a, b, 0.05)), "q95": float(betaincinv(a, b, 0.95))}

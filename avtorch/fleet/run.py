@@ -15,8 +15,8 @@ from avtorch.fleet.cluster import Cluster, connected, require_dask
 from avtorch.fleet.folder import FleetFolder, failure_rows, task_key
 from avtorch.fleet.log_list import FleetLog, LogList, content_hash, fetched, find_logs, is_url
 from avtorch.fleet.ranking import fleet_answer
-from avtorch.fleet.settings import STEPS, FleetSettings
-from avtorch.fleet.task import FleetProgress, Task, worked_off
+from avtorch.fleet.settings import STEPS, FleetSettings, Step
+from avtorch.fleet.task import Task, worked_off
 from avtorch.io import sole_use, write_json
 
 if TYPE_CHECKING:
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 FLEET = "fleet.json"
 READERS = 4
 """Logs read at a time to find out whether they have changed."""
+
+_COST: dict[Step, int] = {"check": 1, "estimate": 25, "diagnose": 100}
+"""How long a step of a log takes beside the others, roughly."""
 
 
 @shows_progress
@@ -58,8 +61,7 @@ def run_fleet(
         retry: try logs again that failed in an earlier call.
         report: makes the page of a diagnosis, such as `avtorch.report.report_html`; it is written beside the rows, and
             a diagnosis of an earlier call that has none is computed again. Workers need to be able to import it.
-        progress: called with (sentence, done, of), in milliseconds of work; or True, False, None, as in
-            `avtorch.diagnose`.
+        progress: called with (sentence, done, of), in units of work; or True, False, None, as in `avtorch.diagnose`.
         connected_to: called with the cluster once there is one.
 
     Raises `InputError` for logs, settings or a cluster that cannot be used, where Dask is not installed, and for a
@@ -93,15 +95,16 @@ def run_fleet(
             with connected(min(workers or _cores(), len(plan.tasks)), memory, scheduler) as cluster:
                 if connected_to is not None:
                     connected_to(cluster)
-                told = FleetProgress(steps, plan.tasks, plan.kept)
-                for task, outcome in worked_off(cluster, plan.tasks):
-                    key = task_key(task.step, task.sha256, task.settings)
+                cost, failed = 0, 0
+                for number, (task, outcome) in enumerate(worked_off(cluster.client, plan.tasks), 1):
+                    key = task_key(task.step, task.sha256, given)
                     about = {"sha256": task.sha256, "seconds": outcome.seconds, "report": outcome.report}
-                    told.done(
-                        task.step,
-                        folder.write(task.step, plan.logs[task.name], key, outcome.rows, **about),
-                        outcome.seconds,
-                    )
+                    failed += folder.write(task.step, task.log, key, outcome.rows, **about) != "done"
+                    cost += _COST[task.step]
+                    if steps is not None:
+                        kept = f", {plan.kept} kept" if plan.kept else ""
+                        words = f"{number} of {len(plan.tasks)} answers, {failed} failed{kept}"
+                        steps(words, cost, sum(_COST[task.step] for task in plan.tasks))
         answer = fleet_answer(found, folder, given)
         answer["notes"] += plan.notes
         answer["work"] = {"kept": plan.kept, "computed": len(plan.tasks)}
@@ -111,13 +114,12 @@ def run_fleet(
 
 @dataclass(frozen=True)
 class _Plan:
-    """The `tasks` that are missing, with the log of each by its name; `kept`: number of answers that are there.
+    """The `tasks` that are missing; `kept`: number of answers that are there.
 
     `notes`: a sentence on each log that cannot be read now, but could in an earlier call.
     """
 
     tasks: list[Task]
-    logs: dict[str, FleetLog]
     kept: int
     notes: list[str]
 
@@ -132,7 +134,6 @@ def _plan(
     progress: Callable[[str, int, int], None] | None,
 ) -> _Plan:
     tasks: list[Task] = []
-    of: dict[str, FleetLog] = {}
     unread: dict[str, str] = {}
     kept = 0
     with ThreadPoolExecutor(READERS) as pool:
@@ -140,36 +141,34 @@ def _plan(
             if progress is not None:
                 progress("reading", number, len(logs))
             for step in settings.steps:
-                if isinstance(content, InputError) and folder.has_answer(step, log):
-                    unread[log.place] = f"Not read this time, its earlier rows are kept: {content}"
-                    kept += 1
-                    continue
-                if isinstance(content, InputError):
-                    rows = failure_rows("crashed", str(content))  # a file that is not there may come
-                    folder.write(step, log, task_key(step, None, settings), rows, sha256=None, seconds=0.0)
+                if isinstance(content, str):
+                    if folder.has_answer(step, log):
+                        unread[log.place] = f"Not read this time, its earlier rows are kept: {content}"
+                        kept += 1
+                    else:  # a file that is not there may come
+                        rows = failure_rows("crashed", content)
+                        folder.write(step, log, task_key(step, None, settings), rows, sha256=None, seconds=0.0)
                     continue
                 sha256, size = content
-                key = task_key(step, sha256, settings)
-                status = folder.kept(step, log, key)
+                status = folder.kept(step, log, task_key(step, sha256, settings))
                 if status == "done" and step == "diagnose" and report is not None and not folder.report(log).is_file():
                     status = None
                 if status == "done" or (status == "failed" and not retry):
                     kept += 1
-                    continue
-                name = f"{step}-{Path(log.file_name).stem}"
-                of[name] = log
-                tasks.append(Task(name, step, log.identity, sha256, size, settings, report=report, shown=log.shown))
+                else:
+                    tasks.append(Task(step, log, log.identity, sha256, size, settings, report))
     # what is soon done first, and the longest diagnoses before the short ones, which then fill the last gaps
     tasks.sort(key=lambda task: (STEPS.index(task.step), -task.size))
-    return _Plan(tasks, of, kept, list(unread.values()))
+    return _Plan(tasks, kept, list(unread.values()))
 
 
-def _content(log: FleetLog) -> tuple[str, int] | InputError:
+def _content(log: FleetLog) -> tuple[str, int] | str:
+    """The hash of a log and its bytes, or why it cannot be read."""
     try:
         with fetched(log.place) as local:
             return content_hash(local)
-    except InputError as fault:
-        return fault
+    except (InputError, OSError) as fault:
+        return str(fault)
 
 
 def _cores() -> int:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from avtorch.arrays import FloatArray
-from avtorch.follower.laws import FollowerMeasurements, HeadwayLaw, tensors
+from avtorch.follower.laws import FollowerMeasurements, HeadwayLaw, of_law
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.effect import delay_key
 from avtorch.vehicle.stability import chain_verdict, frequencies
@@ -37,7 +37,7 @@ def loop_errors(
 
     `values`: the law's as `law.*`, `T_L` [s], the delay [s] by `delay_key()`; `K_L` is 1.
     """
-    own = tensors({k.partition(".")[2]: v for k, v in values.items() if k.startswith("law.")})
+    own = of_law(values)
     s, v, lead = (x.numpy() for x in seen)
     length = min(round(seconds / dt), len(s) - 1)
     delay = values.get(delay_key(), 0.0) / dt
@@ -101,10 +101,9 @@ def loop_stability(law: HeadwayLaw, draws: Mapping[str, FloatArray], speeds: Seq
     The result does not depend on how the loop is divided into controller and car: only the product of gains and `K_L`
     counts.
     """
-    values = {k: torch.as_tensor(x) for k, x in draws.items()}
-    own = {k.partition(".")[2]: x for k, x in values.items() if k.startswith("law.")}
-    delay = values.get(delay_key(), torch.zeros_like(values["T_L"]))
-    chain = actuator(frequencies(points=500), values["T_L"], torch.ones_like(values["T_L"]), delay)
+    own, lag = of_law(draws), torch.as_tensor(draws["T_L"])
+    delay = torch.as_tensor(draws.get(delay_key(), np.zeros_like(draws["T_L"])))
+    chain = actuator(frequencies(points=500), lag, torch.ones_like(lag), delay)
     out = []
     for speed in speeds:
         s, v, lead = law.slopes(own, speed)

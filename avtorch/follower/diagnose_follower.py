@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.display import Card, Displayed, Frame
@@ -19,7 +18,7 @@ from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.follower.closed_loop import LoopErrors, LoopStability, keeps_speed, loop_errors, loop_stability
 from avtorch.follower.identify import Followed, Identified, car_of, followed, identified, seen_in, widened
-from avtorch.follower.laws import LAWS, FollowerMeasurements, HeadwayLaw, law_named, tensors
+from avtorch.follower.laws import LAWS, FollowerMeasurements, HeadwayLaw, law_named, of_law
 from avtorch.gap.diagnose import diagnose
 from avtorch.gap.quantity import Quantity, frame_of
 from avtorch.gap.result.diagnosis import Diagnosis
@@ -29,6 +28,7 @@ from avtorch.io.mapping import Pairs
 
 _LEAST_S = 40.0
 _LOWEST, _HIGHEST = -8.0, 5.0  # bounds of a command [m/s²]; no car is sent more
+_SPOKEN = {"constant_time_gap": "a constant time gap", "intelligent_driver": "the Intelligent Driver Model"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -71,6 +71,24 @@ class FollowerDiagnosis(Displayed):
     def usual(self) -> LoopStability:
         """At the median speed."""
         return self.stability[len(self.stability) // 2]
+
+    def sentences(self) -> list[str]:
+        """Law, headway, lag with delay, string stability, and how well the closed loop does."""
+        q, usual = self.parameters, self.usual
+        own, bare = self.loops[self.law.name], self.loops["without_delay"]
+        peak = "" if usual.peak_gain is None else f", peak gain {_formatted(usual.peak_gain, '')}"
+        rivals = [x for name, x in self.loops.items() if name not in (self.law.name, "without_delay")]
+        other = f" (the other law: {rivals[0].speed:.2g} m/s)" if rivals else ""
+        return [
+            f"Assuming {_SPOKEN[self.law.name]}: headway {_formatted(q['headway_s'], ' s')} at {usual.speed:.0f} m/s, "
+            f"lag with delay {_formatted(q['lag_with_delay_s'], ' s')}.",
+            f"P(string stable) is {usual.p_string_stable:.2f} at {usual.speed:.0f} m/s{peak}. Over a minute the car "
+            f"amplified its leader's speed variation {own.amplified:.2f} times; the simulated loop does "
+            f"{own.amplified_simulated:.2f} times.",
+            f"Driven by the leader alone over a held-out minute, the loop errs by {own.speed:.2g} m/s and "
+            f"{own.spacing:.2g} m{other}; without a dead time by {bare.speed:.2g} m/s and {bare.spacing:.2g} m, and a "
+            f"car at constant speed by {self.keeps_speed:.2g} m/s.",
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """The object of `diagnosis.json` with a further key `follower`; only that key where no cause was sought."""
@@ -185,8 +203,7 @@ def _cause(
     steps: Callable[[str, int, int], None] | None,
 ) -> Diagnosis:
     """The diagnosis of the test half, with the law's commands, starting from the lag and delay of the other half."""
-    law = tensors({k.removeprefix("law."): v for k, v in first.values.items() if k.startswith("law.")})
-    sent = first.candidate.law.command(law, seen_in(half)).numpy()
+    sent = first.candidate.law.command(of_law(first.values), seen_in(half)).numpy()
     late = replace(half, accel=None, accel_cmd=np.clip(sent, _LOWEST, _HIGHEST))
     return diagnose(late, baseline=car_of(first.values), effects=effects, seed=seed, progress=steps or False)
 
@@ -195,9 +212,8 @@ def _parameters(law: HeadwayLaw, draws: Mapping[str, FloatArray], speed: float) 
     quantities = {
         k.removeprefix("law.").removeprefix(f"{delay_effect().name}."): Quantity.of_draws(x) for k, x in draws.items()
     }
-    own = {k.removeprefix("law."): torch.as_tensor(x) for k, x in draws.items() if k.startswith("law.")}
     total = draws["T_L"] + draws.get(delay_key(), 0.0)
-    more = {"lag_with_delay_s": total, "headway_s": law.spacing(own, speed) / speed}
+    more = {"lag_with_delay_s": total, "headway_s": law.spacing(of_law(draws), speed) / speed}
     return quantities | {name: Quantity.of_draws(x) for name, x in more.items()}
 
 
@@ -213,3 +229,7 @@ def _conditional(law: HeadwayLaw, off: float, keeps: float) -> tuple[str, ...]:
         "P(string stable) holds for small motions; it is the whole loop's, controller and car together.",
         "The cause is conditional on the law: where the real controller departs from it, the car takes the cause.",
     )
+
+
+def _formatted(q: Quantity, unit: str) -> str:
+    return f"{q.mean:.2f}{unit} ({q.q05:.2f} to {q.q95:.2f})"

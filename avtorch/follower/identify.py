@@ -31,7 +31,7 @@ from torch import Tensor
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.follower.laws import FollowerMeasurements, HeadwayLaw
+from avtorch.follower.laws import FollowerMeasurements, HeadwayLaw, of_law
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.simulator.effect import delay_effect, delay_key
 from avtorch.gap.simulator.parameter import Parameter
@@ -86,11 +86,6 @@ class Followed:
         return len(self.coordinates)
 
     @property
-    def begins(self) -> tuple[int, ...]:
-        """The row of the log at which each stretch begins."""
-        return tuple(self.data.source[self.data.bounds[:-1]].tolist())
-
-    @property
     def seconds(self) -> float:
         """Time that the car follows [s], in stretches that are long enough."""
         return len(self.data.time) * self.data.dt
@@ -106,7 +101,7 @@ class Followed:
     def residual(self, z: FloatArray) -> FloatArray:
         """Measured less simulated coefficients of the differenced speed, (column, frame, bin)."""
         values, data = self.values(z), self.data
-        law = {k.partition(".")[2]: v[:, None] for k, v in values.items() if k.startswith("law.")}
+        law = {k: v[:, None] for k, v in of_law(values).items()}
         car = {k: v for k, v in values.items() if not k.startswith("law.")} | {"K_L": torch.ones(len(z)).double()}
         speed = np.empty((len(z), len(data.time)))
         with torch.inference_mode():
@@ -181,13 +176,12 @@ _NOISE_ITERATIONS, _NOISE_ENOUGH = 20, 1e-3
 class LoopNoise:
     """`w` (size,): the five sizes and times, standard normal a priori; `variance` (bin,) of coefficients [(m/s²)²].
 
-    `value` [nats]: log density of the residual and of `w`; `information` (size, size) of `w`.
+    `value` [nats]: log density of the residual and of `w`.
     """
 
     w: FloatArray
     variance: FloatArray = field(repr=False)
     value: float
-    information: FloatArray = field(repr=False)
 
     @classmethod
     def of(cls, data: DriveData, residual: FloatArray, lag: float, start: FloatArray | None = None) -> LoopNoise:
@@ -195,7 +189,6 @@ class LoopNoise:
         energy, frames = (residual**2).sum(0), len(residual)
         w, damping = np.zeros(len(_PRIORS)) if start is None else start, 1e-2
         shape, value = _noise_at(data, energy, frames, lag, w)
-        information = np.eye(len(w))
         for _ in range(_NOISE_ITERATIONS):
             ahead = [_log_variance(data, lag, w + step) for step in _NOISE_STEP * np.eye(len(w))]
             slopes = (np.stack(ahead) - shape) / _NOISE_STEP
@@ -212,7 +205,7 @@ class LoopNoise:
                 damping *= 8
             if gain < _NOISE_ENOUGH:
                 break
-        return cls(w, np.exp(shape), value, information)
+        return cls(w, np.exp(shape), value)
 
 
 def _noise_at(data: DriveData, energy: FloatArray, frames: int, lag: float, w: FloatArray) -> tuple[FloatArray, float]:
@@ -243,7 +236,7 @@ _DELAYS_S = (0.3, 1.2)
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """`z` (coordinate,) at the mode, its `covariance`; `log_evidence` [nats] of the fit.
+    """`z` (coordinate,) at the mode, and its `covariance`.
 
     `noise` (bin,): variance of the differenced speed's coefficients [(m/s²)²].
     """
@@ -252,20 +245,18 @@ class Identified:
     z: FloatArray
     covariance: FloatArray = field(repr=False)
     noise: FloatArray = field(repr=False)
-    log_evidence: float
 
     @property
     def values(self) -> Mapping[str, float]:
         """Parameters at the mode, by key: `law.*`, `T_L` [s], `dead_time.delay_s` [s]."""
         return {k: float(v[0]) for k, v in self.candidate.values(self.z[None]).items()}
 
-    def draws(
-        self, covariance: FloatArray | None = None, *, count: int = _DRAWS, seed: int = 0
-    ) -> dict[str, FloatArray]:
-        """Parameters (draw,) of a normal posterior in `z`."""
-        noise = np.random.default_rng(seed).standard_normal((count, len(self.z)))
-        spread = _root(self.covariance if covariance is None else covariance)
-        z = np.clip(self.z + noise @ spread.T, -8.0, 8.0)
+    def draws(self, covariance: FloatArray, *, seed: int = 0) -> dict[str, FloatArray]:
+        """Parameters (draw,) of a normal posterior in `z` with this covariance."""
+        noise = np.random.default_rng(seed).standard_normal((_DRAWS, len(self.z)))
+        # a root that is valid also where round-off made the covariance indefinite
+        values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+        z = np.clip(self.z + noise @ (vectors * np.sqrt(np.maximum(values, 1e-14))).T, -8.0, 8.0)
         return {k: x.numpy() for k, x in self.candidate.values(z).items()}
 
 
@@ -273,10 +264,8 @@ def identified(candidate: Followed, *, start: Identified | None = None) -> Ident
     """The fit to the candidate's log, from a short and a long delay, or from another fit's place."""
     places = [_mode(candidate, z) for z in (_starts(candidate) if start is None else [start.z])]
     best = max(places, key=lambda place: place.value)
-    information = _curvature(candidate, best)[0]
-    size = np.linalg.slogdet(information)[1] + np.linalg.slogdet(best.noise.information)[1]
-    covariance = np.asarray(np.linalg.inv(information), np.float64)
-    return Identified(candidate, best.z, covariance, best.noise.variance, best.value - 0.5 * float(size))
+    covariance = np.asarray(np.linalg.inv(_curvature(candidate, best)[0]), np.float64)
+    return Identified(candidate, best.z, covariance, best.noise.variance)
 
 
 def widened(found: Identified) -> FloatArray:
@@ -352,9 +341,3 @@ def _starts(candidate: Followed) -> list[FloatArray]:
     if delay_key() not in [c.key for c in candidate.coordinates]:
         return [np.zeros(candidate.size)]
     return [candidate.z_of({delay_key(): delay}) for delay in _DELAYS_S]
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    """A root of a covariance, valid also where round-off made it indefinite."""
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    return vectors * np.sqrt(np.maximum(values, 1e-14))

@@ -12,6 +12,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap import Parameter
 
@@ -130,6 +131,8 @@ def law_named(name: str) -> HeadwayLaw:
     return LAWS[name]
 
 
-def tensors(values: Mapping[str, float]) -> dict[str, Tensor]:
-    """Numbers as tensors of no dimension."""
-    return {k: torch.tensor(float(v), dtype=torch.float64) for k, v in values.items()}
+def of_law(values: Mapping[str, float | FloatArray | Tensor]) -> dict[str, Tensor]:
+    """A law's own values by name, out of those of a loop, in which they are `law.NAME`; in their shape."""
+    return {
+        k.removeprefix("law."): torch.as_tensor(x, dtype=torch.float64) for k, x in values.items() if k[:4] == "law."
+    }

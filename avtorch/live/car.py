@@ -1,19 +1,19 @@
-"""One car of a live source, and what is assumed of all: rows put in order, its open window, its belief and monitor."""
+"""Cars watched while they drive: rows put in order, each car's open window, belief and monitor, and its answers."""
 
 from __future__ import annotations
 
 import hashlib
 import math
-from bisect import bisect_left
-from collections.abc import Mapping
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from operator import itemgetter
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from avtorch.decision.monitor import DEFAULT_DETECTORS, Monitor
+from avtorch.decision.monitor import Monitor
 from avtorch.decision.settings import Setting
 from avtorch.decision.watch import Watch, WatchedWindow
 from avtorch.errors import InputError
@@ -22,7 +22,8 @@ from avtorch.inference.latent import LatentForm
 from avtorch.inference.stream import BeliefStream
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.log import STANDSTILL_MPS
-from avtorch.live.source import Counts, Row
+from avtorch.live.source import Batch, Counts, Row
+from avtorch.results import window_entry
 from avtorch.vehicle.controllers import NOMINAL_GAINS
 
 FormName = Literal["auto", "jerk", "latent"]
@@ -37,8 +38,7 @@ class LiveSettings:
     `window` [s]; `form` "jerk" (measured jerk and accel), "latent", or "auto": "jerk" for a car whose first row has
     both; `estimator` and `mode` as in `estimate`, "auto" being "map" for the jerk form and "importance" for the latent
     one, whose modes are dear; `time_gap` [s] and `gains` (k_s [1/s²], k_v [1/s], k_a [-]) of the controller; `accepted`
-    (T_L [s], K_L [-]) of a sound car; `detectors`; `lateness` [s] by which a row may come behind newer ones; `cars` at
-    most; `check_units`: refuse columns that contradict each other; `seed`.
+    (T_L [s], K_L [-]) of a sound car; `lateness` [s] by which a row may come behind newer ones; `cars` at most; `seed`.
 
     Raises `InputError` for numbers out of range.
     """
@@ -50,10 +50,8 @@ class LiveSettings:
     time_gap: float = 1.0
     gains: tuple[float, float, float] = NOMINAL_GAINS
     accepted: tuple[float, float] = (0.3, 1.0)
-    detectors: tuple[str, ...] = DEFAULT_DETECTORS
     lateness: float = 0.05
     cars: int = 1000
-    check_units: bool = True
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -85,14 +83,14 @@ class LiveSettings:
     def watch(self, car: str, form: Form) -> Watch:
         """A new watch of one car. Its seed follows from the car's name, and so not from the order of cars."""
         digest = hashlib.sha256(f"{self.seed}/{car}".encode()).digest()
-        options: dict[str, Any] = {"seed": int.from_bytes(digest[:6], "big"), "check_units": self.check_units}
+        options: dict[str, Any] = {"seed": int.from_bytes(digest[:6], "big")}
         estimator = self.estimator
         if estimator == "auto":
             estimator = "map" if isinstance(form, JerkForm) else "importance"
         if estimator in ("sgld", "map", "importance"):
             options["mode"] = self.mode
         stream = BeliefStream(window=self.window, form=form, estimator=estimator, **options)
-        return Watch(stream, Monitor(accepted=self.accepted, detectors=self.detectors))
+        return Watch(stream, Monitor(accepted=self.accepted))
 
     def to_dict(self) -> dict[str, str]:
         """By name, as text: what a state belongs to. The number of cars may change."""
@@ -103,8 +101,7 @@ TimedRow = tuple[float, ...]
 """Time [s], then the values of the car's columns."""
 
 
-def _time(row: TimedRow) -> float:
-    return row[0]
+_time = itemgetter(0)
 
 
 class ReorderBuffer:
@@ -129,33 +126,19 @@ class ReorderBuffer:
             return None
         if time <= self.released + ROUNDING_S:
             return "doubled" if time >= self.released - ROUNDING_S else "late"
-        place = bisect_left(waiting, time, key=_time)
-        near = [x[0] for x in waiting[max(place - 1, 0) : place + 1]]
-        if any(abs(x - time) <= ROUNDING_S for x in near):
+        place = bisect_left(waiting, time - ROUNDING_S, key=_time)
+        if place < len(waiting) and waiting[place][0] <= time + ROUNDING_S:
             return "doubled"
         waiting.insert(place, row)
         return "reordered"
 
     def ready(self) -> list[TimedRow]:
         """The rows that nothing can overtake any more, in order; they leave the buffer."""
-        waiting = self.waiting
-        edge = self.newest - self.lateness
-        if not waiting or (waiting[0][0] > edge and len(waiting) <= self.most):
-            return []
-        count = max(bisect_left(waiting, edge, key=_time), len(waiting) - self.most)
-        if count < len(waiting) and waiting[count][0] <= edge:
-            count += 1
-        return self._out(count)
+        count = bisect_right(self.waiting, self.newest - self.lateness, key=_time)
+        return self.out(max(count, len(self.waiting) - self.most))
 
-    def drain(self) -> list[TimedRow]:
-        """All rows, in order; they leave the buffer."""
-        return self._out(len(self.waiting))
-
-    def begin_anew(self) -> None:
-        """Forget the clock, once drained: the next row may have any time."""
-        self.newest = self.released = float("-inf")
-
-    def _out(self, count: int) -> list[TimedRow]:
+    def out(self, count: int) -> list[TimedRow]:
+        """The first rows, in order; they leave the buffer."""
         out, self.waiting = self.waiting[:count], self.waiting[count:]
         if out:
             self.released = out[-1][0]
@@ -173,14 +156,18 @@ LIMITS = {"accel_cmd": 100.0, "accel": 100.0, "speed": 200.0, "jerk": 10_000.0, 
 _WAITING = 5000  # rows kept back
 
 
-class LiveWindow(NamedTuple):
-    """A window of one car: its number from 1, what was seen, how far the stream's clock is ahead of the car's [s], and
-    when its end had come (`time.monotonic`)."""
+class Answer(NamedTuple):
+    """What is said of one window: the object that becomes a line of JSON, the car's name, the number of the window, and
+    when its end had come (`time.monotonic`; None where it is no window).
+    """
 
+    entry: dict[str, Any]
+    car: str
     number: int
-    watched: WatchedWindow
-    ahead: float
-    ended: float
+    ended: float | None
+
+
+_KEPT = ("windows", "position", "p_string_stable", "_ahead", "_suspects", "_pending", "_in_window", "_closes", "_last")
 
 
 class LiveCar:
@@ -194,6 +181,7 @@ class LiveCar:
         if form is None:
             raise InputError(f"{name}: found {', '.join(sorted(signals))}; needs accel_cmd, and accel or speed")
         self.name, self.settings, self.counts = name, settings, counts
+        self._setting = settings.setting()
         self.form: Form = form
         more = [x for x in ("speed", "engaged") if x in signals and x not in form.columns]
         self.columns = (*form.columns, *more)
@@ -204,7 +192,6 @@ class LiveCar:
         self.position: int | None = None
         self.windows = 0
         self.p_string_stable = math.nan
-        self.refusal: str | None = None  # of the last rows that were refused as a whole, in words
         self._ahead = 0.0
         self._suspects: list[TimedRow] = []
         self._pending: list[TimedRow] = []  # released, and not yet fed
@@ -213,23 +200,23 @@ class LiveCar:
         self._last = -math.inf
         self._ended: float | None = None
 
-    def take(self, row: Row, arrived: float, setting: Setting) -> list[LiveWindow]:
-        """A row in, the windows out that it completes; one that is left out is counted."""
+    def take(self, row: Row, arrived: float) -> list[Answer]:
+        """A row in, the answers out for the windows that it completes; one that is left out is counted."""
         timed = self._checked(row)
         if isinstance(timed, str):
             self.counts.refuse(timed)
             return []
-        out: list[LiveWindow] = []
+        out: list[Answer] = []
         if abs(row.time - self.order.newest) > JUMP_S and self.order.newest > -math.inf:
             if not self._clock_was_set(timed):
                 return out
-            out = self._begin_anew(arrived, setting)
+            out = self._begin_anew(arrived)
         elif self._suspects:
             self.counts.refuse("jumped", len(self._suspects))
             self._suspects = []
-        return out + self._put(timed, arrived, setting)
+        return out + self._put(timed, arrived)
 
-    def _put(self, timed: TimedRow, arrived: float, setting: Setting) -> list[LiveWindow]:
+    def _put(self, timed: TimedRow, arrived: float) -> list[Answer]:
         fate = self.order.put(timed)
         if fate == "reordered":
             self.counts.reordered += 1
@@ -239,23 +226,23 @@ class LiveCar:
         self.counts.rows += 1
         if self._ended is None and timed[0] >= self._closes:
             self._ended = arrived
-        out: list[LiveWindow] = []
+        out: list[Answer] = []
         for ready in self.order.ready():
             self._pending.append(ready)
             self._in_window += 1
             if ready[0] >= self._closes or ready[0] > self._last + GAP_S:
-                out += self._feed(arrived, setting)
+                out += self._feed(arrived)
             elif self._in_window > MOST_ROWS:
                 self._pending.pop()
                 self.counts.refuse("crowded")
             self._last = ready[0]
         return out
 
-    def flush(self, arrived: float, setting: Setting) -> list[LiveWindow]:
+    def flush(self, arrived: float) -> list[Answer]:
         """All rows that were kept back, and the open window closed early: the source ended."""
-        self._pending += self.order.drain()
-        out = self._feed(arrived, setting)
-        return out + self._windows(lambda: self.watch.flush(setting), 0, arrived)
+        self._pending += self.order.out(len(self.order.waiting))
+        out = self._feed(arrived)
+        return out + self._answers(lambda: self.watch.flush(self._setting), 0, arrived)
 
     def _checked(self, row: Row) -> TimedRow | str:
         """The row as numbers, or why it is left out."""
@@ -287,20 +274,20 @@ class LiveCar:
         self._suspects.append(timed)
         return len(self._suspects) >= CONFIRM
 
-    def _begin_anew(self, arrived: float, setting: Setting) -> list[LiveWindow]:
+    def _begin_anew(self, arrived: float) -> list[Answer]:
         """End what was on the old clock, and take in the rows on the new one but the last."""
-        out = self.flush(arrived, setting)
+        out = self.flush(arrived)
         first, *rest = self._suspects[:-1]
         end = self.order.newest + self._ahead
         self._suspects = []
-        self.order.begin_anew()
+        self.order.newest = self.order.released = -math.inf
         self._ahead = end + self.settings.window - first[0]
         self._last = self._closes = -math.inf
         for timed in (first, *rest):
-            out += self._put(timed, arrived, setting)
+            out += self._put(timed, arrived)
         return out
 
-    def _feed(self, arrived: float, setting: Setting) -> list[LiveWindow]:
+    def _feed(self, arrived: float) -> list[Answer]:
         if not self._pending:
             return []
         rows, self._pending = np.array(self._pending, dtype=np.float64).T, []
@@ -311,31 +298,34 @@ class LiveCar:
         usable = signals["speed"] >= STANDSTILL_MPS if "speed" in signals else None
         engaged = signals.get("engaged")
         clock = torch.from_numpy(time)
-        return self._windows(
-            lambda: self.watch.feed(clock, signals, setting, usable=usable, engaged=engaged), len(time), arrived
+        return self._answers(
+            lambda: self.watch.feed(clock, signals, self._setting, usable=usable, engaged=engaged), len(time), arrived
         )
 
-    def _windows(self, work: Any, rows: int, arrived: float) -> list[LiveWindow]:
-        """The windows that `work` gives, numbered; what it refuses is counted, and the watch goes on."""
-        self.refusal = None
+    def _answers(self, work: Callable[[], list[WatchedWindow]], rows: int, arrived: float) -> list[Answer]:
+        """The windows that `work` gives, numbered; what it refuses is counted and said, and the watch goes on."""
+        found, refusal = [], None
         try:
-            found: list[WatchedWindow] = work()
+            found = work()
         except InputError as fault:
             self.counts.refuse("contradictory", rows)
-            self.refusal, found = str(fault), []
+            refusal = str(fault)
         except (RuntimeError, ValueError, ArithmeticError) as fault:
             # numbers that no likelihood bears: the car begins with the first prior again
             self.counts.refuse("failed", rows)
-            self.refusal, found = f"not computed ({type(fault).__name__}); the belief begins anew", []
+            refusal = f"not computed ({type(fault).__name__}); the belief begins anew"
             self.watch = self.settings.watch(self.name, self.form)
-        ended = arrived if self._ended is None else self._ended
         out = []
         for watched in found:
             self.windows += 1
             self.p_string_stable = float(watched.report.p_string_stable[0])
             self.counts.alerts.update(watched.report.names())
-            out.append(LiveWindow(self.windows, watched, self._ahead, ended))
+            entry = window_answer(self.name, self.windows, watched, self._ahead)
+            out.append(Answer(entry, self.name, self.windows, arrived if self._ended is None else self._ended))
         self.counts.windows += len(found)
+        if refusal is not None:
+            entry = {"car": self.name, "after_window": self.windows, "refused": refusal}
+            out.append(Answer(entry, self.name, self.windows, None))
         closes = self.watch.stream.closes_at
         # the stream itself allows for round-off in a clock that counts 0.01 s
         closes = -math.inf if closes is None else closes - self._ahead - 2 * ROUNDING_S
@@ -345,17 +335,9 @@ class LiveCar:
 
     def state_dict(self) -> dict[str, Any]:
         """All that later windows depend on, as tensors and plain values."""
-        rows = {"waiting": self.order.waiting, "suspects": self._suspects, "pending": self._pending}
-        width = 1 + len(self.columns)
-        clock = (self.order.newest, self.order.released, self._ahead, self._closes, self._last)
-        return {
-            "car": self.name,
-            "columns": list(self.columns),
-            "watch": self.watch.state_dict(),
-            "rows": {name: torch.tensor(x, dtype=torch.float64).reshape(-1, width) for name, x in rows.items()},
-            "clock": torch.tensor(clock, dtype=torch.float64),
-            "numbers": {"windows": self.windows, "in_window": self._in_window, "position": self.position},
-            "p_string_stable": self.p_string_stable,
+        own = {name: getattr(self, name) for name in _KEPT}
+        return {"car": self.name, "columns": self.columns, "watch": self.watch.state_dict(), "own": own} | {
+            "order": vars(self.order)
         }
 
     @classmethod
@@ -363,27 +345,79 @@ class LiveCar:
         """A car that goes on from `state_dict` to the bit. Raises `InputError` for anything else."""
         try:
             car = cls(state["car"], set(state["columns"]), settings, counts)
-            if car.columns != tuple(state["columns"]):
-                raise InputError(f"state: found the columns {state['columns']}, not {list(car.columns)}")
             car.watch.load_state_dict(state["watch"])
-            rows = {
-                name: _rows(state["rows"][name].numpy(), car.columns) for name in ("waiting", "suspects", "pending")
-            }
-            car.order.waiting, car._suspects, car._pending = rows["waiting"], rows["suspects"], rows["pending"]
-            clock = state["clock"].tolist()
-            car.order.newest, car.order.released, car._ahead, car._closes, car._last = clock
-            car.windows, car._in_window = int(state["numbers"]["windows"]), int(state["numbers"]["in_window"])
-            position = state["numbers"]["position"]
-            car.position = None if position is None else int(position)
-            car.p_string_stable = float(state["p_string_stable"])
-        except (KeyError, TypeError, ValueError, AttributeError) as fault:
-            if isinstance(fault, InputError):
-                raise
+            vars(car).update({name: state["own"][name] for name in _KEPT})
+            vars(car.order).update(state["order"])
+        except (KeyError, TypeError) as fault:
             raise InputError(f"state: is not a car's ({type(fault).__name__})") from None
         return car
 
 
-def _rows(saved: NDArray[Any], columns: tuple[str, ...]) -> list[TimedRow]:
-    if saved.ndim != 2 or saved.shape[1] != 1 + len(columns) or not bool(np.isfinite(saved).all()):
-        raise InputError("state: rows: are not those of a car")
-    return [tuple(row) for row in saved.tolist()]
+def window_answer(car: str, number: int, watched: WatchedWindow, ahead: float = 0.0) -> dict[str, Any]:
+    """A line of `avtorch watch`: the entry of a window as in `estimates.json`, on the car's own clock, with the car,
+    the window's number and a sentence for every alert. `ahead`: of the stream's clock on the car's [s]."""
+    entry = window_entry(watched)
+    if ahead != 0.0:
+        entry |= {key: round(entry[key] - ahead, 6) for key in ("start_s", "end_s")}
+    form = "jerk" if "sigma" in watched.window.belief.names else "latent"
+    why = [watched.report.why(name) for name in watched.report.names()]
+    return {"car": car, "window": number, "form": form, **entry, "why": why}
+
+
+class LiveWatch:
+    """Watches of many cars, one each, made when a car's first row comes."""
+
+    def __init__(self, settings: LiveSettings | None = None, counts: Counts | None = None) -> None:
+        self.settings = LiveSettings() if settings is None else settings
+        self.counts = Counts() if counts is None else counts
+        self.cars: dict[str, LiveCar] = {}
+        self._warm: set[type[Form]] = set()
+
+    def take(self, batch: Batch) -> list[Answer]:
+        """Take in a batch; returns what is to be said, in the order of the rows that ended the windows."""
+        if batch.anew:
+            for car in self.cars.values():
+                car.position = None
+        answers: list[Answer] = []
+        for row in batch.rows:
+            car = self.cars.get(row.car) or self._new(row)
+            if car is None:
+                continue
+            if row.position is not None:
+                if car.position is not None and row.position <= car.position:
+                    continue  # taken in before a restart
+                car.position = row.position
+            answers += car.take(row, batch.arrived)
+        return answers
+
+    def flush(self, arrived: float) -> list[Answer]:
+        """Close the open windows of all cars: the source ended for good."""
+        return [answer for car in self.cars.values() for answer in car.flush(arrived)]
+
+    def _new(self, row: Row) -> LiveCar | None:
+        """The watch of a car that has not been seen before; None, and counted, where there can be none."""
+        signals = {name for name, value in row.signals.items() if value is not None}
+        form = self.settings.form_of(signals)
+        if form is None:
+            self.counts.refuse("incomplete")
+            return None
+        if len(self.cars) >= self.settings.cars:
+            self.counts.refuse("too many cars")
+            return None
+        self.warm_up(form)
+        return self.cars.setdefault(row.car, LiveCar(row.car, signals, self.settings, self.counts))
+
+    def warm_up(self, form: Form) -> None:
+        """Compile what the estimator needs before the first window depends on it, once a form."""
+        if type(form) in self._warm:
+            return
+        self._warm.add(type(form))
+        time = 0.02 * torch.arange(round(2.5 * self.settings.window / 0.02), dtype=torch.float64)
+        command = 3.0 * torch.sin(2.0 * time)
+        # the exact answer of a car of lag 0.5 s to a sine, behind its transient
+        accel = 0.5 * (command - 3.0 * torch.cos(2.0 * time))
+        noise = 0.05 * torch.randn(3, len(time), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        rows = {"accel_cmd": command, "accel": accel + noise[0], "jerk": 2.0 * (command - accel) + noise[1]}
+        rows["speed"] = 20.0 - 0.75 * (torch.cos(2.0 * time) + torch.sin(2.0 * time)) + noise[2]
+        needed = {name: rows[name] for name in form.columns}
+        self.settings.watch("", form).feed(time, needed, self.settings.setting())

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import os
 import select
-import stat
 import time
 from collections.abc import Generator, Iterator
 from pathlib import Path
+from threading import Event
 from typing import BinaryIO
 
-from avtorch.errors import InputError, printable
-from avtorch.io.opening import kind_of
-from avtorch.live.source import LONGEST, Batch, LineParser, Row, Stop
+from avtorch.io.opening import opened
+from avtorch.live.source import LONGEST, Batch, LineParser
 
 CHUNK = 2**16
 """Bytes read at once."""
@@ -28,39 +27,29 @@ class _Lines:
     def __init__(self, position: int = 0) -> None:
         self.position = position
         self._rest = b""
-        self._skipping = False
 
     def of(self, chunk: bytes) -> Iterator[tuple[bytes, int]]:
-        *lines, rest = (self._rest + chunk).split(b"\n")
+        *lines, self._rest = (self._rest + chunk).split(b"\n")
         for line in lines:
             self.position += len(line) + 1
-            if self._skipping:
-                self._skipping = False  # the end of a line that was given up before
-                continue
             yield line, self.position
-        if len(rest) > LONGEST:
-            self.position += len(rest)
-            if not self._skipping:
-                yield rest, self.position  # which is refused for its length
-            self._skipping, rest = True, b""
-        self._rest = rest
+        if len(self._rest) > LONGEST:  # refused for its length, and what follows of it as no row
+            yield from self.last()
 
     def last(self) -> Iterator[tuple[bytes, int]]:
-        """The last line, where no line end follows."""
+        """What no line end follows."""
         rest, self._rest = self._rest, b""
-        if rest and not self._skipping:
-            self.position += len(rest)
-            yield rest, self.position
+        self.position += len(rest)
+        yield rest, self.position
 
 
-def _batch(parser: LineParser, lines: Iterator[tuple[bytes, int]], at: _Lines, *, seekable: bool) -> Batch:
+def _batch(
+    parser: LineParser, lines: Iterator[tuple[bytes, int]], at: _Lines, *, seekable: bool, anew: bool = False
+) -> Batch:
     arrived = time.monotonic()
-    rows: list[Row] = []
-    for line, position in lines:
-        row = parser.row(line, position if seekable else None)
-        if row is not None:
-            rows.append(row)
-    return Batch(rows, at.position if seekable else None, arrived=arrived)
+    parsed = [parser.row(line, position if seekable else None) for line, position in lines]
+    rows = [row for row in parsed if row is not None]
+    return Batch(rows, at.position if seekable else None, anew, arrived)
 
 
 class StreamSource:
@@ -72,10 +61,10 @@ class StreamSource:
     def __init__(self, parser: LineParser, descriptor: int = 0) -> None:
         self.parser, self._descriptor = parser, descriptor
 
-    def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
+    def batches(self, stop: Event, start: int | None = None) -> Generator[Batch, None, None]:
         """As the contract; there is nothing to go back to, so `start` has no meaning."""
         lines = _Lines()
-        while not stop.is_set:
+        while not stop.is_set():
             # a descriptor that is read without waiting could not be stopped while it is silent
             if not select.select([self._descriptor], [], [], WAIT_S)[0]:
                 yield Batch([])
@@ -96,7 +85,7 @@ class FileSource:
     def __init__(self, path: str | os.PathLike[str], parser: LineParser, *, follow: bool = False) -> None:
         self.path, self.parser, self.follow = Path(path), parser, follow
         self._file: BinaryIO | None = None
-        self._seen()
+        self._opened().close()
 
     @property
     def name(self) -> str:
@@ -105,19 +94,18 @@ class FileSource:
     @property
     def identity(self) -> str | None:
         """The path and the file behind it: a file that takes its place is another."""
-        found = self._seen() if self._file is None else os.fstat(self._file.fileno())
+        found = os.stat(self.path) if self._file is None else os.fstat(self._file.fileno())
         return f"{self.path.absolute()} {found.st_ino}"
 
-    def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
+    def batches(self, stop: Event, start: int | None = None) -> Generator[Batch, None, None]:
         """As the contract; `start` in bytes."""
         self._file = file = self._opened()
         try:
             lines, anew = self._begun(file, start)
-            while not stop.is_set:
+            while not stop.is_set():
                 chunk = file.read(CHUNK)
                 if chunk:
-                    batch = _batch(self.parser, lines.of(chunk), lines, seekable=True)
-                    yield Batch(batch.rows, batch.position, anew, batch.arrived)
+                    yield _batch(self.parser, lines.of(chunk), lines, seekable=True, anew=anew)
                     anew = False
                 elif not self.follow:
                     yield _batch(self.parser, lines.last(), lines, seekable=True)
@@ -126,7 +114,7 @@ class FileSource:
                     yield _batch(self.parser, lines.last(), lines, seekable=True)
                     file.close()
                     self._file = file = self._opened()
-                    self.parser.begin()
+                    self.parser.header = None
                     lines, anew = _Lines(), True
                 else:
                     yield Batch([], lines.position)
@@ -142,13 +130,13 @@ class FileSource:
             return _Lines(), start is not None
         # a CSV's header, or what shows that it is JSON, is of every run
         before = self.parser.counts.to_dict()
-        while not self.parser.begun() and file.tell() < start and (line := file.readline(LONGEST)):
+        while self.parser.header is None and file.tell() < start and (line := file.readline(LONGEST)):
             self.parser.row(line)
         self.parser.counts.load(before)
         if file.tell() <= start:
             file.seek(start)
             return _Lines(start), False
-        self.parser.begin()
+        self.parser.header = None
         file.seek(0)
         return _Lines(), False
 
@@ -161,24 +149,5 @@ class FileSource:
         mine = os.fstat(file.fileno())
         return (now.st_ino, now.st_dev) != (mine.st_ino, mine.st_dev) or mine.st_size < position
 
-    def _seen(self) -> os.stat_result:
-        """Raises `InputError` where no file of rows is there."""
-        try:
-            found = os.stat(self.path)
-        except (OSError, ValueError) as fault:
-            raise self._unreadable(fault) from None
-        if not stat.S_ISREG(found.st_mode):
-            what = kind_of(found.st_mode)
-            raise InputError(f"{self.path}: is {what}; a file of rows, or - for standard input, is needed")
-        return found
-
     def _opened(self) -> BinaryIO:
-        self._seen()
-        try:
-            return open(self.path, "rb")
-        except OSError as fault:
-            raise self._unreadable(fault) from None
-
-    def _unreadable(self, fault: OSError | ValueError) -> InputError:
-        why = fault.strerror if isinstance(fault, OSError) else printable(str(fault), 80)
-        return InputError(f"{self.path}: cannot be read ({why}); a file of rows is needed")
+        return opened(self.path, need="a file of rows, or - for standard input,")

@@ -13,12 +13,13 @@ import threading
 import time
 from collections.abc import Generator
 from dataclasses import dataclass
+from threading import Event
 from typing import Any
-from urllib.parse import unquote
+from urllib.parse import unquote, urlsplit
 
 from avtorch.errors import InputError, printable, quoted
-from avtorch.live.live_watch import Answer
-from avtorch.live.source import Batch, LineParser, Row, Stop
+from avtorch.live.car import Answer
+from avtorch.live.source import Batch, LineParser, Row
 from avtorch.live.watch_source import line_of
 
 INSTALL = "pip install 'avtorch[live]'"
@@ -53,31 +54,27 @@ class MqttAddress:
         """
         scheme, _, rest = url.partition("://")
         authority, _, topic = rest.partition("/")
-        login, _, place = authority.rpartition("@")
-        user, _, password = (unquote(part) for part in login.partition(":"))
-        # [::1]:1883, the brackets of IPv6
-        bracketed, _, behind = place[1:].partition("]") if place.startswith("[") else ("", "", "")
-        host, _, port = (bracketed, "", behind.removeprefix(":")) if bracketed else place.partition(":")
-        number = port or ("8883" if scheme == "mqtts" else "1883")
         # a password with a slash of its own would else be told as host and topic
         shown = quoted(f"{scheme}://{rest.rpartition('@')[2]}", 80)
-        if scheme not in ("mqtt", "mqtts") or not host or not _is_port(number):
+        try:
+            found = urlsplit(f"//{authority}")
+            port = found.port or (8883 if scheme == "mqtts" else 1883)
+        except ValueError:
+            raise InputError(f"MQTT: found {shown}, {_NEED}") from None
+        if scheme not in ("mqtt", "mqtts") or not found.hostname:
             raise InputError(f"MQTT: found {shown}, {_NEED}")
         if "@" in topic and "@" not in authority and ":" in authority:
             need = "in a password / is %2F; where there is none, needs @ before the host"
             raise InputError(f"MQTT: found @ behind the first /, before {shown}; {need}")
         if not topic or "\0" in topic or len(topic.encode()) > 65535:
             raise InputError(f"MQTT: found {shown}, without a topic; {_NEED}")
-        return MqttAddress(host, int(number), topic, scheme == "mqtts", user or None, password or None)
+        user, password = (unquote(part or "") or None for part in (found.username, found.password))
+        return MqttAddress(found.hostname, port, topic, scheme == "mqtts", user, password)
 
     @property
     def name(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'mqtts' if self.tls else 'mqtt'}://{host}:{self.port}/{self.topic}"
-
-
-def _is_port(text: str) -> bool:
-    return text.isascii() and text.isdecimal() and 0 < int(text) < 65536
 
 
 def is_mqtt(text: str) -> bool:
@@ -128,11 +125,11 @@ class MqttSource:
         self._client.on_subscribe = self._on_subscribe
         self._client.on_message = self._on_message
 
-    def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
+    def batches(self, stop: Event, start: int | None = None) -> Generator[Batch, None, None]:
         """As the contract; a broker has no positions, so `start` has no meaning."""
         _connect(self._client, self.address)
         try:
-            while not stop.is_set:
+            while not stop.is_set():
                 fault = self._client.loop(_WAIT_S)
                 for _ in range(MESSAGES):
                     had = len(self._rows)
@@ -180,10 +177,10 @@ class MqttSink:
     Raises `InputError` where paho-mqtt is missing, the broker cannot be reached, or the topic has wildcards.
     """
 
-    def __init__(self, address: MqttAddress, stop: Stop | None = None) -> None:
+    def __init__(self, address: MqttAddress, stop: Event | None = None) -> None:
         if any(mark in address.topic for mark in "+#"):
             raise InputError(f"{address.name}: answers need one topic, without + and #")
-        self.address, self._stop = address, Stop() if stop is None else stop
+        self.address, self._stop = address, Event() if stop is None else stop
         self._sent = self._acknowledged = 0
         self._changed = threading.Condition()
         self._client = _client(address, None)
@@ -198,7 +195,7 @@ class MqttSink:
 
     def write(self, answer: Answer) -> bool:
         """Send; waits while too many answers are on their way, until the watch is stopped."""
-        self._wait(lambda: self.unsent < UNACKNOWLEDGED or self._stop.is_set)
+        self._wait(lambda: self.unsent < UNACKNOWLEDGED or self._stop.is_set())
         self._client.publish(self.address.topic, line_of(answer).strip(), qos=1)
         self._sent += 1
         return True

@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Generator
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from avtorch.io import Log
 from avtorch.io.log import no_command
 from avtorch.io.mapping import Pairs
 from avtorch.io.sealed import fingerprint
-from avtorch.live.source import SIGNALS, Batch, Row, Stop
+from avtorch.live.source import SIGNALS, Batch, Row
 
 ROWS = 500
 """Rows of a batch where nothing is waited for."""
@@ -55,11 +56,11 @@ class PlayedLog:
         self._elapsed = np.asarray(log.elapsed, np.float64)
         self.identity = f"{Path(path).absolute()} {fingerprint([self._time, self._signals])}"
 
-    def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
+    def batches(self, stop: Event, start: int | None = None) -> Generator[Batch, None, None]:
         """As the contract; `start` in rows."""
         row, rows = start or 0, len(self._time)
         begun, first = time.monotonic(), float(self._elapsed[min(row, rows - 1)])
-        while row < rows and not stop.is_set:
+        while row < rows and not stop.is_set():
             end = min(row + ROWS, rows)
             if self.rate is not None:
                 now = first + (time.monotonic() - begun) * self.rate

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from avtorch.errors import InputError
-from avtorch.live.car import LiveCar
-from avtorch.live.live_watch import Answer, LiveWatch
+from avtorch.live.car import Answer, LiveCar, LiveWatch
 
 INSTALL = "pip install 'avtorch[live]'"
 CARS = 200

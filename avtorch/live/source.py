@@ -13,6 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
+from threading import Event
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -47,17 +48,6 @@ class Batch:
     arrived: float = field(default_factory=time.monotonic)
 
 
-class Stop:
-    """Set to make a source end after the batch it is at; a source looks at it at least every fifth of a second."""
-
-    def __init__(self) -> None:
-        self.is_set = False
-
-    def set(self) -> None:
-        """Ask the source to end."""
-        self.is_set = True
-
-
 class Source(Protocol):
     """Where rows come from."""
 
@@ -71,9 +61,9 @@ class Source(Protocol):
         """What a position belongs to; None where the source cannot be read again."""
         ...
 
-    def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
-        """Batches until the source ends or `stop` is set; empty ones while nothing comes. `start`: a position to read
-        on from."""
+    def batches(self, stop: Event, start: int | None = None) -> Generator[Batch, None, None]:
+        """Batches until the source ends or `stop` is set, which it looks at every fifth of a second; empty ones while
+        nothing comes. `start`: a position to read on from."""
         ...
 
 
@@ -112,14 +102,9 @@ class Counts:
         return {**own, "refused": dict(self.refused), "alerts": dict(self.alerts)}
 
     def load(self, state: Mapping[str, Any]) -> None:
-        """Go on from `to_dict`. Raises `InputError` for anything else."""
-        try:
-            numbers = {name: int(state[name]) for name in ("rows", "reordered", "windows", "repeated")}
-            tables = [Counter({str(k): int(v) for k, v in state[name].items()}) for name in ("refused", "alerts")]
-        except (KeyError, TypeError, ValueError, AttributeError):
-            raise InputError("state: counts: are not those of a watch") from None
-        vars(self).update(numbers)
-        self.refused, self.alerts = tables
+        """Go on from `to_dict`."""
+        vars(self).update(state)
+        self.refused, self.alerts = Counter(state["refused"]), Counter(state["alerts"])
 
 
 SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "engaged")
@@ -150,27 +135,21 @@ class LineParser:
         self._columns = [(name, columns.get(name, name)) for name in SIGNALS]
         one = np.ones(1)
         self._factors = {name: float(to_si(name, text)(one)[0]) for name, text in units.items()}
-        self._header: list[str] | None = None
-        self._json: bool | None = None
-
-    def begin(self) -> None:
-        """What comes is another file's, with a first line of its own."""
-        self._header = self._json = None
-
-    def begun(self) -> bool:
-        """Whether the first line was seen: a CSV's header, or one that is JSON."""
-        return bool(self._json) or self._header is not None
+        self._second = self._factors.pop("time", 1.0)
+        self.header: list[str] | None = None
+        """Of CSV; empty where the first line was JSON. None before it, as where another file takes the place."""
 
     def row(self, line: bytes, position: int | None = None) -> Row | None:
         """The row of a line; None for an empty line, a header, and what was counted as refused."""
         if not line.strip():
             return None
-        if self._json is None:
+        if self.header is None:
             line = line.removeprefix(b"\xef\xbb\xbf")
-            self._json = line.lstrip().startswith((b"{", b"["))
+            if line.lstrip().startswith((b"{", b"[")):
+                self.header = []
         if len(line) > LONGEST:
             return self._refused("corrupt")
-        return self._of_json(line, position, self.car) if self._json else self._of_csv(line, position)
+        return self._of_json(line, position, self.car) if self.header == [] else self._of_csv(line, position)
 
     def message(self, payload: bytes, *, car: str) -> list[Row]:
         """The rows of a message: an object, several in a list, or one a line; `car` names the car of those without."""
@@ -213,17 +192,17 @@ class LineParser:
 
     def _of_csv(self, line: bytes, position: int | None) -> Row | None:
         try:
-            cells = [cell.strip() for cell in next(csv.reader([line.decode("utf-8-sig")]))]
+            cells = [cell.strip() for cell in next(csv.reader([line.decode()]))]
         except (UnicodeDecodeError, csv.Error, StopIteration):
             return self._refused("corrupt")
-        if self._header is None:
-            self._header = self._checked(cells)
+        if self.header is None:
+            self.header = self._checked(cells)
             return None
-        if cells == self._header:  # of a file begun again
+        if cells == self.header:  # of a file begun again
             return None
-        if len(cells) != len(self._header):
+        if len(cells) != len(self.header):
             return self._refused("corrupt")
-        found = dict(zip(self._header, cells, strict=True))
+        found = dict(zip(self.header, cells, strict=True))
         time = _number(found.get(self._time, ""))
         if time is None:
             return self._refused("incomplete")
@@ -243,34 +222,22 @@ class LineParser:
         return cells
 
     def _made(self, car: str, time: float, signals: dict[str, Any], position: int | None) -> Row | None:
-        if not car or len(car) > _CAR or not _is_text(car):
-            return self._refused("corrupt")
-        if self._factors:
-            return self._scaled(Row(car, time, signals, position))
-        return Row(car, time, signals, position)
-
-    def _scaled(self, row: Row) -> Row | None:
-        factors = self._factors
         try:
-            signals: Mapping[str, Any] = {
-                name: value * factors[name] if name in factors and value is not None else value
-                for name, value in row.signals.items()
-            }
+            car.encode()  # JSON may hold half of a surrogate pair
+        except UnicodeEncodeError:
+            return self._refused("corrupt")
+        if not car or len(car) > _CAR:
+            return self._refused("corrupt")
+        try:
+            for name, factor in self._factors.items():
+                if signals.get(name) is not None:
+                    signals[name] *= factor
         except (TypeError, OverflowError):  # an integer of four hundred digits is no float
             return self._refused("implausible")
-        return row._replace(time=row.time * factors.get("time", 1.0), signals=signals)
+        return Row(car, time * self._second, signals, position)
 
     def _refused(self, kind: str) -> None:
         self.counts.refuse(kind)
-
-
-def _is_text(name: str) -> bool:
-    """Whether it can be written: JSON may hold half of a surrogate pair."""
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _number(text: str) -> float | str | None:

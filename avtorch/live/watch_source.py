@@ -13,21 +13,21 @@ import json
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
+from threading import Event
 from typing import IO, Any, Protocol
 
 from avtorch.errors import InputError
 from avtorch.inference.stream import packed, unpacked
 from avtorch.io import read_sealed, read_sealed_bytes, write_sealed
 from avtorch.io.answers import json_text
-from avtorch.live.car import LiveCar
-from avtorch.live.live_watch import Answer, LiveWatch
-from avtorch.live.source import Source, Stop
+from avtorch.live.car import Answer, LiveCar, LiveWatch
+from avtorch.live.source import Source
 from avtorch.version import __version__
 
-CAR, RECORD = "avtorch.live_car/1", "avtorch.live_source/1"
+CAR, RECORD = "avtorch.live_car/2", "avtorch.live_source/2"
 MOST = 2**28
 """Bytes of a car's state at most; it takes some 0.1 MB."""
 EVERY_S = 10.0
@@ -43,8 +43,10 @@ class KeptCars:
 
     def __init__(self, folder: str | Path, identity: str | None = None) -> None:
         self.folder, self.identity = Path(folder), identity
-        self._written: dict[str, float] = {}  # by car, when
-        self._at: dict[str, int | None] = {}  # by car, the position that its file holds
+        self._record_path = self.folder / "source.json"
+        there = self._record_path.exists()
+        self._found = read_sealed(self._record_path, schema=RECORD, remedy=REMEDY) if there else None
+        self._written: dict[str, tuple[float, int | None]] = {}  # by car: when, and the position that its file holds
         self._begun: int | None = None
         self._recorded = time.monotonic()
         self._next = 0.0
@@ -52,23 +54,22 @@ class KeptCars:
     @property
     def same_source(self) -> bool:
         """Whether the folder holds states of this very source, which can be read on from where they end."""
-        record = self.folder / "source.json"
-        if self.identity is None or not record.exists():
-            return False
-        return read_sealed(record, schema=RECORD, remedy=REMEDY).content.get("source") == self.identity
+        found = self._found
+        return found is not None and self.identity is not None and found.content["source"] == self.identity
 
     def restore(self, watch: LiveWatch) -> int | None:
-        """Bring `watch` to the state in the folder; returns the position to read the source from, None for its start.
+        """Bring `watch` to the state in the folder, and name the source there; returns the position to read it from,
+        None for its start.
 
         Raises `InputError` for states of other settings, and for damaged ones.
         """
-        record = self.folder / "source.json"
-        if not record.exists():
+        if self._found is None:
+            # so that a run killed before its first state is known to be of it, too
+            self._record(watch, None)
             return None
-        found = read_sealed(record, schema=RECORD, remedy=REMEDY)
-        self._same(found.of, watch, record)
-        content = found.content
-        watch.counts.load(content.get("counts", {}))
+        self._same(self._found.of, watch, self._record_path)
+        watch.counts.load(self._found.content["counts"])
+        same = self.same_source
         for path in sorted(self.folder.glob("*.car")):
             sealed = read_sealed_bytes(path, schema=CAR, most=MOST, remedy=REMEDY)
             self._same(sealed.of, watch, path)
@@ -76,19 +77,11 @@ class KeptCars:
                 car = LiveCar.restored(unpacked(sealed.content, path, REMEDY), watch.settings, watch.counts)
             except InputError as fault:
                 raise InputError(f"{path}: {fault}; {REMEDY}") from None
-            watch.cars[car.name] = car
-        same = self.same_source
-        position = content.get("position") if same else None
-        for car in watch.cars.values():
             car.position = car.position if same else None
-            self._at[car.name] = car.position
-        self._begun = position if type(position) is int else None
+            watch.cars[car.name] = car
+            self._written[car.name] = time.monotonic(), car.position
+        self._begun = self._found.content["position"] if same else None
         return self._begun
-
-    def begin(self, watch: LiveWatch) -> None:
-        """Name the source in the folder, so that a run killed before its first state is known to be of it, too."""
-        if not (self.folder / "source.json").exists():
-            self._record(watch, None)
 
     def begin_anew(self, watch: LiveWatch, identity: str | None) -> None:
         """Positions count from 0 again, in a source of another identity; all states are written."""
@@ -101,18 +94,16 @@ class KeptCars:
         if now < self._next:
             return
         self._next = now + EVERY_S / max(200, 2 * len(watch.cars))  # so that each has its turn
-        for car in watch.cars.values():
-            if car.name not in self._written:
-                self._written[car.name] = now
-                self._at.setdefault(car.name, self._begun)
-        due = min(self._written, key=self._written.__getitem__, default=None)
-        if due is not None and now - self._written[due] >= EVERY_S:
+        for name in watch.cars:
+            self._written.setdefault(name, (now, self._begun))
+        due = min(self._written, key=lambda name: self._written[name][0], default=None)
+        if due is not None and now - self._written[due][0] >= EVERY_S:
             self._write_car(watch, watch.cars[due])
         if now - self._recorded >= EVERY_S:
             self._recorded = now
-            safe = [self._at[car.name] for car in watch.cars.values() if car.position != self._at[car.name]]
-            known = [x for x in safe if x is not None]
-            self._record(watch, position if not safe else min(known) if len(known) == len(safe) else self._begun)
+            behind = [at for name, (_, at) in self._written.items() if watch.cars[name].position != at]
+            known = [at for at in behind if at is not None]
+            self._record(watch, position if not behind else min(known) if len(known) == len(behind) else self._begun)
 
     def write(self, watch: LiveWatch, position: int | None = None) -> None:
         """Write all states and the record, at the end."""
@@ -124,24 +115,23 @@ class KeptCars:
         name = hashlib.sha256(car.name.encode("utf-8", "surrogatepass")).hexdigest()[:24]
         path = self.folder / f"{name}.car"
         write_sealed(path, packed(car.state_dict()), schema=CAR, of=_work(watch))
-        self._written[car.name], self._at[car.name] = time.monotonic(), car.position
+        self._written[car.name] = time.monotonic(), car.position
 
     def _record(self, watch: LiveWatch, position: int | None) -> None:
         content = {"source": self.identity, "position": position, "counts": watch.counts.to_dict()}
-        write_sealed(self.folder / "source.json", content, schema=RECORD, of=_work(watch))
+        write_sealed(self._record_path, content, schema=RECORD, of=_work(watch))
 
     @staticmethod
     def _same(of: dict[str, Any], watch: LiveWatch, path: Path) -> None:
         """Raises `InputError` that names the setting in which a state differs from the watch."""
-        own = _work(watch)
-        for name, value in {**own["settings"], "avtorch": own["avtorch"]}.items():
-            found = of.get("avtorch") if name == "avtorch" else of.get("settings", {}).get(name)
-            if found != value:
-                raise InputError(f"{path}: was begun with {name} {str(found)[:40]}, not {value}; {REMEDY}")
+        for name, value in _work(watch).items():
+            if of.get(name) != value:
+                raise InputError(f"{path}: was begun with {name} {str(of.get(name))[:40]}, not {value}; {REMEDY}")
 
 
-def _work(watch: LiveWatch) -> dict[str, Any]:
-    return {"avtorch": __version__, "settings": watch.settings.to_dict()}
+def _work(watch: LiveWatch) -> dict[str, str]:
+    """What a state belongs to, by name."""
+    return {**watch.settings.to_dict(), "avtorch": __version__}
 
 
 class Sink(Protocol):
@@ -163,17 +153,6 @@ class Sink(Protocol):
 def line_of(answer: Answer) -> str:
     """The answer as one line of JSON, with its line end."""
     return json_text(answer.entry, indent=None, ascii_only=True).strip() + "\n"
-
-
-def _answered(entry: Any) -> tuple[str, int]:
-    """The car and the number of the window of an answer; 0 for one that has none, as the refusal of a car.
-
-    Raises `ValueError` or another error of bad lines for what is no answer, such as the rows of a source.
-    """
-    car, window = entry["car"], entry.get("window", 0)
-    if type(car) is not str or type(window) is not int or "accel_cmd" in entry:
-        raise ValueError("no answer")
-    return car, window
 
 
 class LineSink:
@@ -231,23 +210,19 @@ class FileSink(LineSink):
                     break
                 whole += len(line)
                 try:
-                    car, window = _answered(json.loads(line))
-                except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+                    entry = json.loads(line)
+                    # 0 for the refusal of a car
+                    car, window = entry["car"], entry.get("window", 0)
+                except (ValueError, TypeError, KeyError, RecursionError):
+                    entry, car, window = {}, None, None
+                if type(car) is not str or type(window) is not int or "accel_cmd" in entry:
                     raise InputError(
                         f"{self.path}, line {number}: is no answer of avtorch watch; needs another name for --out"
-                    ) from None
+                    )
                 if resume:
                     self._written[car] = max(window, self._written.get(car, 0))
             # what a killed run left of its last line
             stream.truncate(whole)
-
-
-class Observer(Protocol):
-    """Is told of every answer once it is written."""
-
-    def answered(self, answer: Answer, car: LiveCar, seconds: float | None) -> None:
-        """`seconds` from the arrival of the row that ended the window to the answer's being written."""
-        ...
 
 
 def watch_source(
@@ -255,11 +230,14 @@ def watch_source(
     watch: LiveWatch,
     sinks: Sequence[Sink],
     *,
-    stop: Stop | None = None,
+    stop: Event | None = None,
     kept: KeptCars | None = None,
-    observers: Sequence[Observer] = (),
+    answered: Callable[[Answer, LiveCar, float | None], None] | None = None,
 ) -> None:
     """Watch the cars of `source` until it ends or `stop` is set; every answer goes to all `sinks`.
+
+    `answered` is called with each answer once it is written, its car, and the seconds from the arrival of the row that
+    ended the window.
 
     With `kept`, the watch goes on from the state in its folder, and leaves its state there at the end, however that
     comes; open windows stay open in it. Without it they are closed early where the source ends.
@@ -268,10 +246,8 @@ def watch_source(
 
     Raises `InputError` for a state that does not fit, and for what source and sinks raise.
     """
-    stop = Stop() if stop is None else stop
+    stop = Event() if stop is None else stop
     position = None if kept is None else kept.restore(watch)
-    if kept is not None:
-        kept.begin(watch)
 
     def tell(answers: Sequence[Answer]) -> None:
         for answer in answers:
@@ -282,14 +258,12 @@ def watch_source(
             sink.flush()
         now = time.monotonic()
         for answer in answers:
-            seconds = None if answer.ended is None else now - answer.ended
-            for observer in observers:
-                observer.answered(answer, watch.cars[answer.car], seconds)
+            if answered is not None:
+                answered(answer, watch.cars[answer.car], None if answer.ended is None else now - answer.ended)
 
-    start = position
     whole = True  # no batch is half taken in
     try:
-        with closing(source.batches(stop, start)) as batches:
+        with closing(source.batches(stop, position)) as batches:
             for batch in batches:
                 if batch.anew and kept is not None:
                     kept.begin_anew(watch, source.identity)
@@ -298,7 +272,7 @@ def watch_source(
                 whole = True
                 if kept is not None:
                     kept.keep(watch, position)
-        if kept is None and not stop.is_set:
+        if kept is None and not stop.is_set():
             tell(watch.flush(time.monotonic()))
     finally:
         # after an error in the middle of a batch the states on disk are the ones to go on from

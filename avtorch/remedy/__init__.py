@@ -5,9 +5,9 @@ from avtorch.remedy.exports import CarlaPedals as CarlaPedals
 from avtorch.remedy.exports import Exported as Exported
 from avtorch.remedy.exports import SumoType as SumoType
 from avtorch.remedy.exports import to_autoware, to_carla, to_openpilot, to_sumo, write_exports
-from avtorch.remedy.linearised import linearised as linearised
 from avtorch.remedy.trial import Trial
 from avtorch.remedy.what_to_set import WhatToSet, setting_for, what_to_set
+from avtorch.remedy.what_to_set import linearised as linearised
 
 __all__ = [
     "Trial",

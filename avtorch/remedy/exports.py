@@ -20,7 +20,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -28,7 +28,7 @@ from xml.etree import ElementTree
 
 import torch
 
-from avtorch.gap import FREE_FORMS, Effect, ForceTable, GapPlant, ResistanceCurve
+from avtorch.gap import FREE_FORMS, ForceTable, GapPlant, ResistanceCurve
 from avtorch.io import answer_set, atomic
 from avtorch.pedals import MapTable, PedalMap, accel_table, brake_table
 
@@ -49,38 +49,35 @@ class Exported:
         return "\n".join([*lines, *(f"{name}: {value:.6g}" for name, value in self.values.items())]) + "\n"
 
 
-def not_exported(plant: GapPlant, reported: Collection[str] = ()) -> tuple[str, ...]:
-    """A sentence for each effect of `plant` but those `reported`, which are held or have a sentence already."""
-    return tuple(
-        f"{e.name}: {SENSOR if e.place == 'sensor' else e.meaning}" for e in plant.effects if e.name not in reported
-    )
-
-
-SENSOR = "the sensor's, not the car's"
-OVERSHOOT = "its overshoot; the time constant is that of the two poles together"
-
-
-def overshoots(effect: Effect) -> bool:
-    """Whether it makes the actuator one of second order."""
-    return "tau" in effect.actuator_parameters()
-
-
-def delays_of(plant: GapPlant) -> list[str]:
-    """Names of the effects that delay commands and do nothing else."""
-    return [e.name for e in plant.effects if e.shift is not None]
-
-
-def delay_of(plant: GapPlant) -> float:
+def _delay(plant: GapPlant) -> float:
     """Total delay [s] that all effects add to the command."""
     return sum((float(getattr(e, e.shift)) for e in plant.effects if e.shift is not None), 0.0)
 
 
-def gain_lost(plant: GapPlant, why: str) -> list[str]:
-    """A sentence on `K_L`, where it is not 1 to a hundredth."""
-    gain = float(plant.K_L)
-    return [f"K_L {gain:.3g}: {why}"] if abs(gain - 1) > 0.01 else []
+def _lost(
+    plant: GapPlant, *, gain: str = "", delay: str = "", limit: str | None = None, overshoot: str | None = None
+) -> list[str]:
+    """A sentence on each property of `plant` that a tool does not have.
+
+    `gain` of `K_L`, and of effects that delay commands, limit the acceleration or make the actuator overshoot: what is
+    said of them; empty where the tool has it, None: what the effect means.
+    """
+    value = float(plant.K_L)
+    found = [f"K_L {value:.3g}: {gain}"] if gain and abs(value - 1) > 0.01 else []
+    for e in plant.effects:
+        text = "the sensor's, not the car's" if e.place == "sensor" else e.meaning
+        if e.shift is not None:
+            text = delay
+        elif e.accel_limits() is not None and limit is not None:
+            text = limit
+        elif "tau" in e.actuator_parameters() and overshoot is not None:
+            text = overshoot
+        if text:
+            found.append(f"{e.name}: {text}")
+    return found
 
 
+_OVERSHOOT = "its overshoot; the time constant is that of the two poles together"
 _NO_DELAY = "SUMO has no delay; actionStepLength is the time between two decisions of the driver model"
 _ELSEWHERE = "of Plexe's model CC alone; every other model and TraCI answer at the next step"
 _OWN = "no limit was found, so SUMO's default limits the car"
@@ -117,11 +114,9 @@ def to_sumo(plant: GapPlant) -> SumoType:
         values |= {"decel": brake, "emergencyDecel": brake}
     else:
         lost.append(f"decel: {_OWN}")
-    lost += gain_lost(plant, "a car does what it is asked to, as far as its limits allow")
-    lost += [f"{name}: {_NO_DELAY}" for name in delays_of(plant)]
-    lost += [f"{e.name}: {OVERSHOOT}" for e in plant.effects if overshoots(e)]
-    held = [e.name for e in plant.effects if e.accel_limits() is not None or overshoots(e)]
-    return SumoType("SUMO vType", values, (*lost, *not_exported(plant, [*held, *delays_of(plant)])))
+    gain = "a car does what it is asked to, as far as its limits allow"
+    lost += _lost(plant, gain=gain, delay=_NO_DELAY, limit="", overshoot=_OVERSHOOT)
+    return SumoType("SUMO vType", values, tuple(lost))
 
 
 _NO_LAG = "VehicleControl has neither; what the model has comes from its physics"
@@ -148,14 +143,13 @@ def to_carla(pedals: PedalMap, plant: GapPlant | None = None) -> CarlaPedals:
     """The map `pedals` for throttle and brake; of the `plant`, if one was found behind them, only what is lost."""
     given = {"throttle": accel_table(pedals), "brake": brake_table(pedals)}
     tables = {name: table for name, table in given.items() if table is not None}
-    lag, late = (pedals.T_L, pedals.dead_time) if plant is None else (float(plant.T_L), delay_of(plant))
+    lag, late = (pedals.T_L, pedals.dead_time) if plant is None else (float(plant.T_L), _delay(plant))
     lost = [f"lag {lag:.3g} s and dead time {late:.3g} s: {_NO_LAG}"]
     lost += [f"{name}: the log has none" for name, table in given.items() if table is None]
     lost += dict.fromkeys(text for table in tables.values() for text in table.lost[1:])  # the first is the lag again
     lost.append(f"physics: {_PHYSICS}")
     if plant is not None:
-        lost += gain_lost(plant, "the tables hold K_L 1; multiply the accelerations")
-        lost += not_exported(plant, delays_of(plant))
+        lost += _lost(plant, gain="the tables hold K_L 1; multiply the accelerations")
     return CarlaPedals("CARLA VehicleControl", {}, tuple(lost), tables)
 
 
@@ -183,23 +177,22 @@ def to_autoware(plant: GapPlant) -> Exported:
         debug_acc_scaling_factor: 1
     """
     values = {
-        "acc_time_delay": delay_of(plant),
+        "acc_time_delay": _delay(plant),
         "acc_time_constant": float(plant.T_L),
         "debug_acc_scaling_factor": float(plant.K_L),
     }
     bounds = [x for e in plant.effects for x in e.accel_limits() or () if math.isfinite(x)]
     if bounds:
         values["vel_rate_lim"] = max(abs(x) for x in bounds)
-    limiting = [e.name for e in plant.effects if e.accel_limits() is not None]
-    lost = [f"{name}: limits that differ for driving and braking; the tool's one is the wider" for name in limiting]
-    lost += [f"{e.name}: {OVERSHOOT}" for e in plant.effects if overshoots(e)]
-    partly = [*limiting, *delays_of(plant), *(e.name for e in plant.effects if overshoots(e))]
-    tool = "Autoware planning simulator"
+    tool, others = "Autoware planning simulator", plant
     if acceleration_map(plant) is not None:
         tool += f", vehicle_model_type DELAY_STEER_MAP_ACC_GEARED with acceleration_map_path {ACCELERATION_MAP}"
-        values["debug_acc_scaling_factor"] = 1.0  # the gain is in the map
-        partly += [kind.name for kind in FREE_FORMS]
-    return Exported(tool, values, (*lost, *not_exported(plant, partly)))
+        values["debug_acc_scaling_factor"] = 1.0  # the gain is in the map, as the free form is
+        others = GapPlant(
+            [e for e in plant.effects if not isinstance(e, FREE_FORMS)], T_L=plant.T_L, K_L=1.0, sigma=0.0
+        )
+    limit = "limits that differ for driving and braking; the tool's one is the wider"
+    return Exported(tool, values, tuple(_lost(others, limit=limit, overshoot=_OVERSHOOT)))
 
 
 def acceleration_map(plant: GapPlant) -> str | None:
@@ -231,11 +224,9 @@ def to_openpilot(plant: GapPlant) -> Exported:
         >>> {k: round(v, 2) for k, v in to_openpilot(plant(baseline="dead_time=0.2", T_L=0.4)).values.items()}
         {'longitudinalActuatorDelay': 0.6}
     """
-    delay = delay_of(plant) + float(plant.T_L)
-    lost = gain_lost(plant, "a gain is learned on the way")
-    return Exported(
-        "openpilot CarParams", {"longitudinalActuatorDelay": delay}, (*lost, *not_exported(plant, delays_of(plant)))
-    )
+    delay = _delay(plant) + float(plant.T_L)
+    lost = _lost(plant, gain="a gain is learned on the way")
+    return Exported("openpilot CarParams", {"longitudinalActuatorDelay": delay}, tuple(lost))
 
 
 def write_exports(plant: GapPlant | None, folder: str | PathLike[str], *, pedals: PedalMap | None = None) -> list[Path]:
@@ -245,11 +236,14 @@ def write_exports(plant: GapPlant | None, folder: str | PathLike[str], *, pedals
 
     Raises `InputError` where the folder cannot be written.
     """
-    made = [None] * 3 if plant is None else [to_autoware(plant), to_openpilot(plant), to_sumo(plant)]
-    exports = [*made, None if pedals is None else to_carla(pedals, plant)]
-    texts = [None if x is None else x.to_text() for x in exports]
-    texts.append(None if plant is None else acceleration_map(plant))
-    there = {name: text for name, text in zip(FILES, texts, strict=True) if text is not None}
+    exports: dict[str, Exported] = {}
+    if plant is not None:
+        exports = dict(zip(FILES, (to_autoware(plant), to_openpilot(plant), to_sumo(plant)), strict=False))
+    if pedals is not None:
+        exports["plant.carla.yaml"] = to_carla(pedals, plant)
+    there = {name: export.to_text() for name, export in exports.items()}
+    if plant is not None and (table := acceleration_map(plant)) is not None:
+        there[ACCELERATION_MAP] = table
     with answer_set(folder, FILES) as staged:
         for name, text in there.items():
             with atomic(staged / name) as stream:

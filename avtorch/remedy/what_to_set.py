@@ -23,16 +23,16 @@ from avtorch.decision.algorithm2 import ACCEPTED_CHANGE
 from avtorch.decision.grid import GAINS_GRID, Grid
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
-from avtorch.gap import GapPlant
+from avtorch.gap import GapPlant, RoadGrade, SimulatorInput
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.effect_response import is_linear, is_one_sided
-from avtorch.remedy.linearised import linearised
-from avtorch.vehicle.stability import Chain, chain_verdict
+from avtorch.vehicle.stability import Chain, chain_verdict, frequencies
 
 SOFTER: tuple[tuple[float, float, float], ...] = tuple(product((0.1, 0.2, 0.4, 0.8), (0.4, 0.7, 1.0), (-0.8, -0.2)))
 """Gains on offer besides the strategist's: a loop with dead time needs calmer gains and a longer gap."""
 SPEEDS_MPS = (5.0, 15.0, 30.0)
 STEP_MPS2 = 0.5
+_LIMITS_MPS2 = (-6.0, 4.0)  # beyond which a command is clipped
 _BLOCK = 32  # settings evaluated at a time
 
 
@@ -40,11 +40,10 @@ _BLOCK = 32  # settings evaluated at a time
 class WhatToSet(Displayed):
     """`p_now`, `p_then`: P(string stable) with the setting in force and with the one to `set`.
 
-    `peak_now`, `peak_then`: median peak gain [-] at the worst of speeds and pedals, inf where disturbances grow, and in
-    `peaks` with its 5 and 95 % quantiles. `p_assumed`, `peak_assumed`: of the simulator as it was, without the effect;
-    so its string gain was off by `peak_now - peak_assumed`. `sufficient`: `p_then` reaches `required`. `clipped`: share
-    of the log's commands that `set` would have clipped. `strategies` out of 1 (lower level), 2 (time gap), 3 (gains), 4
-    (feed-forward). `why`: one sentence. `notes`: what holds for steps of one size only.
+    `p_assumed`: of the simulator as it was, without the effect. `peaks` of these three, as `assumed`, `in_force` and
+    `then`: median, 5 and 95 % quantile of the peak gain [-] at the worst of speeds and pedals, inf where disturbances
+    grow. `clipped`: share of the log's commands that `set` would have clipped. `strategies` out of 1 (lower level), 2
+    (time gap), 3 (gains), 4 (feed-forward). `notes`: what holds for steps of one size only.
     """
 
     in_force: Setting = field(repr=False)
@@ -52,16 +51,26 @@ class WhatToSet(Displayed):
     p_assumed: float
     p_now: float
     p_then: float
-    peak_assumed: float
-    peak_now: float
-    peak_then: float
     peaks: Mapping[str, tuple[float, float, float]]
     required: float
-    sufficient: bool
     strategies: tuple[int, ...]
     clipped: float
-    why: str
     notes: tuple[str, ...] = ()
+
+    @property
+    def sufficient(self) -> bool:
+        """Whether `p_then` reaches `required`."""
+        return self.p_then >= self.required
+
+    @property
+    def peak_now(self) -> float:
+        """The median peak gain [-] with the setting in force."""
+        return self.peaks["in_force"][0]
+
+    @property
+    def peak_then(self) -> float:
+        """The median peak gain [-] with the one to `set`."""
+        return self.peaks["then"][0]
 
     def overview(self) -> Card:
         """What to set and why; P(string stable) and peak gain with each setting."""
@@ -69,7 +78,7 @@ class WhatToSet(Displayed):
             {
                 "": ["simulator as it was", "setting in force", "setting to use"],
                 "P(string stable)": [self.p_assumed, self.p_now, self.p_then],
-                "peak gain [-]": [self.peak_assumed, self.peak_now, self.peak_then],
+                "peak gain [-]": [self.peaks["assumed"][0], self.peak_now, self.peak_then],
             }
         )
         return Card("What to set", (self.why,), table)
@@ -92,6 +101,36 @@ class WhatToSet(Displayed):
             "notes": list(self.notes),
         }
 
+    @property
+    def why(self) -> str:
+        """What to set, and what comes of it, in a sentence."""
+        steps = []
+        s = self.set.as_dict()
+        if 1 in self.strategies:
+            model = f"a lower level that models T {s['T_hat']:.2f} s and K {s['K_hat']:.2f}"
+            steps.append(f"{model} and targets a lag of {s['T_d']:.2f} s")
+        if 2 in self.strategies:
+            steps.append(f"time gap {s['time_gap_s']:g} s instead of {self.in_force.as_dict()['time_gap_s']:g} s")
+        if 3 in self.strategies:
+            steps.append("gains " + ", ".join(f"{k:g}" for k in s["gains"]))
+        if 4 in self.strategies:
+            steps.append(f"feed the leader's acceleration forward with k_f {s['feedforward']:g}")
+        if not steps and self.sufficient:
+            return (
+                "Nothing to set: as it is, disturbances die out along a line of such cars with probability "
+                f"{self.p_now:.2f} (string stability)."
+            )
+        if not steps:
+            return (
+                "no available setting lets disturbances die out along a line of such cars (string stability), and none "
+                f"is better than the one in force (probability that they do: {self.p_now:.2f})."
+            )
+        what = "; ".join(steps)
+        change = f"probability of string stability {self.p_then:.2f} instead of {self.p_now:.2f}"
+        if self.sufficient:
+            return f"{what} ({change}); the least intrusive setting that is sufficient."
+        return f"no available setting reaches {self.required:g}; the best is {what} ({change})."
+
 
 def what_to_set(
     plant: GapPlant,
@@ -102,26 +141,19 @@ def what_to_set(
     in_force: Setting | None = None,
     grid: Grid | None = None,
     required: float = 0.95,
-    speeds: Sequence[float] = SPEEDS_MPS,
-    accel_min: float = -6.0,
-    accel_max: float = 4.0,
-    link_delay: float = 0.0,
 ) -> WhatToSet:
     """The least intrusive setting that makes `plant` string stable with probability `required`.
 
     `belief`: draws (draw,) of the plant's parameters by its names (`T_L`, `K_L`, `effect.parameter`); `assumed`: draws
     of `T_L` [s] and `K_L` of the simulator without the effect. `commands` (row,) [m/s²]: a log's, in which clipping is
     counted. Default setting in force: time gap 1 s, the paper's gains, the lower level passing through. `grid`: what is
-    on offer. Limits [m/s²]. `link_delay` [s]: age of the leader's acceleration, where a setting feeds it forward.
-    Raises `InputError` for a probability or speeds out of range.
+    on offer. Raises `InputError` for a probability out of range.
     """
     if not 0.0 < required < 1.0:
         raise InputError(f"required: found {required}, needs a number between 0 and 1")
-    if not speeds or min(speeds) <= 0:
-        raise InputError(f"speeds: found {tuple(speeds)}, needs one or more above 0")
     draws = {k: torch.as_tensor(np.asarray(v), dtype=torch.float64) for k, v in belief.items()}
     now = Setting(scenarios=1) if in_force is None else in_force
-    chains = _chains(plant, draws, speeds)
+    chains = _chains(plant, draws)
     T, K = (draws[name].mean().reshape(1) for name in ("T_L", "K_L"))
     # a model within the paper's accepted change is not known to be wrong
     stale = ((T - now.T_hat).abs() > ACCEPTED_CHANGE[0]) | ((K - now.K_hat).abs() > ACCEPTED_CHANGE[1])
@@ -130,15 +162,14 @@ def what_to_set(
     )
     cost = offers.cost[0]
     order = [i for i in cost.argsort(stable=True).tolist() if bool(torch.isfinite(cost[i]))]
-    used = np.zeros(0) if commands is None else np.asarray(commands, float)
-    clipped = _clipped(offers.setting[0], used, accel_min, accel_max)
+    clipped = _clipped(offers.setting[0], np.zeros(0) if commands is None else np.asarray(commands, float))
 
-    p, peaks = _string_stability(chains, now, link_delay)
+    p, peaks = _string_stability(chains, now)
     p_now, now_at = float(p[0]), _quantiles(peaks[0])
     best, p_best, then_at = 0, p_now, now_at
     for first in range(0, len(order) if p_now < required else 0, _BLOCK):
         some = order[first : first + _BLOCK]
-        p, peaks = _string_stability(chains, offers.setting[0][torch.tensor(some)], link_delay)
+        p, peaks = _string_stability(chains, offers.setting[0][torch.tensor(some)])
         good = [k for k, i in enumerate(some) if p[k] >= required and clipped[i] <= 0.05]
         if good:
             best, p_best, then_at = some[good[0]], float(p[good[0]]), _quantiles(peaks[good[0]])
@@ -150,10 +181,8 @@ def what_to_set(
     chosen = offers.setting[0][torch.tensor([best])]
     bare = GapPlant((), T_L=plant.T_L, K_L=plant.K_L, sigma=0.0)
     thought = {k: torch.as_tensor(np.asarray(v), dtype=torch.float64) for k, v in (assumed or {}).items()}
-    p_thought, thought_at = _string_stability(_chains(bare, thought or draws, speeds[:1]), now, link_delay)
+    p_thought, thought_at = _string_stability(_chains(bare, thought or draws), now)
     at = {"assumed": _quantiles(thought_at[0]), "in_force": now_at, "then": then_at}
-    sufficient = p_best >= required
-    strategies = tuple(sorted(chosen.strategies(now)[0]))
     names = [e.name for e in plant.effects if not is_linear(e)]
     notes = (f"{' and '.join(names)}: evaluated for steps of {STEP_MPS2:g} m/s².",) if names else ()
     return WhatToSet(
@@ -162,15 +191,10 @@ def what_to_set(
         p_assumed=float(p_thought[0]),
         p_now=p_now,
         p_then=p_best,
-        peak_assumed=at["assumed"][0],
-        peak_now=now_at[0],
-        peak_then=then_at[0],
         peaks=at,
         required=required,
-        sufficient=sufficient,
-        strategies=strategies,
+        strategies=tuple(sorted(chosen.strategies(now)[0])),
         clipped=float(clipped[best]),
-        why=_sentence(chosen, now, strategies, p_now, p_best, sufficient, required),
         notes=notes,
     )
 
@@ -180,8 +204,8 @@ def setting_for(
 ) -> WhatToSet | None:
     """Call `what_to_set` for the car of a diagnosis; None where the verdict is `unknown`.
 
-    `commands` (row,) [m/s²]: the log's. `more`: `in_force`, `grid`, `required`, `speeds`, limits, as in `what_to_set`,
-    which raises `InputError` for those out of range.
+    `commands` (row,) [m/s²]: the log's. `more`: `in_force`, `grid`, `required`, as in `what_to_set`, which raises
+    `InputError` for a probability out of range.
 
     Example:
         >>> from avtorch import Leader, diagnose, simulate
@@ -199,17 +223,20 @@ def setting_for(
     return what_to_set(car, found.belief, assumed=found.assumed, commands=commands, **more)
 
 
-def _chains(plant: GapPlant, draws: Mapping[str, Tensor], speeds: Sequence[float]) -> list[Chain]:
+def _chains(plant: GapPlant, draws: Mapping[str, Tensor]) -> list[Chain]:
     """Chains at every speed; driving and braking separately where the plant responds differently to them."""
     bends = any(is_one_sided(e) for e in plant.effects)
-    at = speeds if any(e.needs_speed for e in plant.effects) else speeds[:1]
+    at = SPEEDS_MPS if any(e.needs_speed for e in plant.effects) else SPEEDS_MPS[:1]
     steps = (STEP_MPS2, -STEP_MPS2) if bends else (STEP_MPS2,)
     return [linearised(plant, draws, speed=v, step=u) for v in at for u in steps]
 
 
-def _string_stability(chains: Sequence[Chain], settings: Setting, link_delay: float) -> tuple[Tensor, Tensor]:
+def _string_stability(chains: Sequence[Chain], settings: Setting) -> tuple[Tensor, Tensor]:
     """P(string stable) (setting,) and the peak gain (setting, draw), each draw at its worst chain."""
-    inner, forward = _lower(settings)
+    # the lower level's command per unit of sensed and of demanded acceleration
+    zero, one = torch.zeros_like(settings.T_hat), torch.ones_like(settings.T_hat)
+    lower = settings.lower_level(accel_min=-1e9, accel_max=1e9)
+    inner, forward = lower.raw_command(one, zero), lower.raw_command(zero, one)
     stable, peak = None, None
     for chain in chains:
         verdict = chain_verdict(
@@ -219,7 +246,6 @@ def _string_stability(chains: Sequence[Chain], settings: Setting, link_delay: fl
             inner=inner[:, None],
             forward=forward[:, None],
             feedforward=settings.feedforward[:, None],
-            feedforward_delay=link_delay,
         )
         stable = verdict.string_stable if stable is None else stable & verdict.string_stable
         peak = verdict.peak_gain if peak is None else torch.maximum(peak, verdict.peak_gain)
@@ -235,51 +261,66 @@ def _quantiles(peak: Tensor) -> tuple[float, float, float]:
     return middle, low, high
 
 
-def _lower(settings: Setting) -> tuple[Tensor, Tensor]:
-    """The lower level's command per unit of sensed and of demanded acceleration."""
-    zero, one = torch.zeros_like(settings.T_hat), torch.ones_like(settings.T_hat)
-    lower = settings.lower_level(accel_min=-1e9, accel_max=1e9)
-    return lower.raw_command(one, zero), lower.raw_command(zero, one)
-
-
-def _clipped(settings: Setting, commands: FloatArray, low: float, high: float) -> list[float]:
+def _clipped(settings: Setting, commands: FloatArray) -> list[float]:
     """Share of the log's commands that each setting would have clipped, scaled by its inversion."""
     if not len(commands):
         return [0.0] * len(settings.T_hat)
     sizes = settings.amplification().numpy()[:, None] * commands
-    return ((sizes < low) | (sizes > high)).mean(1).tolist()
-
-
-def _sentence(
-    chosen: Setting, now: Setting, strategies: tuple[int, ...], before: float, then: float, good: bool, required: float
-) -> str:
-    steps = []
-    s = chosen.as_dict()
-    if 1 in strategies:
-        model = f"a lower level that models T {s['T_hat']:.2f} s and K {s['K_hat']:.2f}"
-        steps.append(f"{model} and targets a lag of {s['T_d']:.2f} s")
-    if 2 in strategies:
-        steps.append(f"time gap {s['time_gap_s']:g} s instead of {now.as_dict()['time_gap_s']:g} s")
-    if 3 in strategies:
-        steps.append("gains " + ", ".join(f"{k:g}" for k in s["gains"]))
-    if 4 in strategies:
-        steps.append(f"feed the leader's acceleration forward with k_f {s['feedforward']:g}")
-    if not steps:
-        if good:
-            return (
-                "Nothing to set: as it is, disturbances die out along a line of such cars with probability "
-                f"{before:.2f} (string stability)."
-            )
-        return (
-            "no available setting lets disturbances die out along a line of such cars (string stability), and none is "
-            f"better than the one in force (probability that they do: {before:.2f})."
-        )
-    what = "; ".join(steps)
-    change = f"probability of string stability {then:.2f} instead of {before:.2f}"
-    if good:
-        return f"{what} ({change}); the least intrusive setting that is sufficient."
-    return f"no available setting reaches {required:g}; the best is {what} ({change})."
+    return ((sizes < _LIMITS_MPS2[0]) | (sizes > _LIMITS_MPS2[1])).mean(1).tolist()
 
 
 def _finite(x: float) -> float | None:
     return x if np.isfinite(x) else None
+
+
+_DT, _SECONDS, _BEFORE = 0.01, 30.0, 1.0
+_LATE = 1e5  # [s], when every change of gain is over
+_ASIDE = 0.5  # [m/s]
+
+
+def linearised(
+    plant: GapPlant, belief: Mapping[str, Tensor] | None = None, *, speed: float, step: float = 0.5
+) -> Chain:
+    """The chain of `plant` at `speed` [m/s] for steps of `step` [m/s²] (below 0: braking).
+
+    `belief`: draws (draw,) of its parameters by the plant's names; without, its own values, and a batch of one. Drags
+    and pushes are linearised at that speed, random effects and the road are left out.
+
+    The responses come from simulating the plant, so any effect works, including a user's own. A step of the command
+    gives the motion and the sensor's reading of it; runs at slightly higher and lower speed give the drop of
+    acceleration with speed. A nonlinearity (a dead band, play, a limit) is represented by its response to a step of
+    that size.
+    """
+    # the road is not a property of the car
+    own = [e for e in plant.effects if not e.random and not isinstance(e, RoadGrade)]
+    car = GapPlant(own, T_L=plant.T_L, K_L=plant.K_L, sigma=0.0)
+    given = {k: v for k, v in (belief or {}).items() if k in car.parameters()}
+    values = {k: torch.as_tensor(v, dtype=torch.float64).reshape(-1) for k, v in {**car.values(), **given}.items()}
+    time = _LATE + _DT * torch.arange(round((_SECONDS + _BEFORE) / _DT), dtype=torch.float64)
+    begin = round(_BEFORE / _DT)
+    command = torch.zeros_like(time)
+    command[begin:] = step
+
+    def answer(u: Tensor, v: float) -> tuple[Tensor, Tensor]:
+        with torch.no_grad():
+            response = car.response(SimulatorInput(time, u, torch.full_like(time, v)), values)
+        return response.accel, response.accel_measured
+
+    rests, moves = answer(torch.zeros_like(command), speed), answer(command, speed)
+    omega = frequencies(most=100.0)
+    # linear between samples: the rate is piecewise constant, and its transform exact
+    middle = _DT * (torch.arange(len(time) - begin, dtype=torch.float64) + 0.5) - _DT
+    half = 0.5 * omega * _DT
+    turn = torch.exp(-1j * middle[:, None] * omega) * (torch.sin(half) / half)
+    motion, reading = (
+        ((m - r).diff(dim=-1)[..., begin - 1 :] / step).to(torch.complex128) @ turn
+        for m, r in zip(moves, rests, strict=True)
+    )
+    faster, slower = (answer(torch.zeros_like(command), speed + x)[0][..., -1] for x in (_ASIDE, -_ASIDE))
+    drag = (slower - faster) / (2 * _ASIDE)
+    count = max(len(v) for v in values.values())
+    shape = (count, len(omega))
+    motion, reading = motion.expand(shape), reading.expand(shape)
+    small = motion.abs() < 1e-9
+    sensed = torch.where(small, 0.0, reading / torch.where(small, 1.0, motion))
+    return Chain(omega, motion, sensed, drag.expand(count))

@@ -20,7 +20,7 @@ import pytest
 import avtorch.decision.estimation
 import avtorch.decision.supervisor
 import avtorch.experiment
-import avtorch.follower.words
+import avtorch.follower
 import avtorch.gap.compare
 import avtorch.paper
 import avtorch.plots.style
@@ -122,6 +122,9 @@ class Followed:
     def to_dict(self) -> dict[str, Any]:
         return {"of": self.of}
 
+    def sentences(self) -> list[str]:
+        return [self.of]
+
 
 def follower(c: Command) -> None:
     time = columns()["time"]
@@ -130,7 +133,6 @@ def follower(c: Command) -> None:
     c.lines = {"old": line, "new": line}
     given = {"old": {"plant": plant([DeadTime(0.182)])}, "new": {"plant": None}}
     c.stand_in(avtorch.follower, "diagnose_follower", lambda log, **_: Followed(c.of, answer([log], **given[c.of])))
-    c.stand_in(avtorch.follower.words, "loop_lines", lambda found: [found.of])
     c.stand_in(sys.modules["avtorch.report.diagnosis"], "report_html", lambda *_, **__: f"page of {c.of}")
 
 

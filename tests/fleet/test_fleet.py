@@ -18,7 +18,7 @@ from avtorch.errors import InputError
 from avtorch.fleet import FleetSettings, read_rows, run_fleet
 from avtorch.fleet import task as tasks
 from avtorch.fleet.folder import schema
-from avtorch.fleet.log_list import marks_of
+from avtorch.fleet.log_list import FleetLog, key_of
 from avtorch.io import Log
 from avtorch.results import window_entry
 from tests.bars import BAR
@@ -300,17 +300,15 @@ def test_logs_by_url(tmp_path: Path, scheduler: str) -> None:
 
 def test_a_log_that_changes_meanwhile_is_not_taken_for_the_old_one(tmp_path: Path) -> None:
     drive().write(tmp_path / "a.csv")
-    task = tasks.Task("check-a", "check", str(tmp_path / "a.csv"), "0" * 64, 1, QUICK)
-    (row,) = tasks.work(task).rows
+    log = FleetLog(str(tmp_path / "a.csv"), "a")
+    (row,) = tasks.work(tasks.Task("check", log, log.identity, "0" * 64, 1, QUICK)).rows
     assert row["status"] == "crashed"
     assert "changed while the fleet ran" in row["error"]
-    (row,) = tasks.work(replace(task, version="0.0.1")).rows
-    assert "needs 0.0.1" in row["error"]
 
 
-def test_marks_of_what_is_no_file_of_rows(tmp_path: Path) -> None:
+def test_what_is_no_file_of_rows_has_no_key(tmp_path: Path) -> None:
     (tmp_path / "a.parquet").write_bytes(b"PAR1 and no more")
-    assert marks_of(tmp_path / "a.parquet") == marks_of(tmp_path / "b.parquet") == {}
+    assert key_of(tmp_path / "a.parquet") is key_of(tmp_path / "b.parquet") is None
 
 
 def test_a_call_with_nothing_to_compute_loads_neither_torch_nor_dask(tmp_path: Path, scheduler: str) -> None:

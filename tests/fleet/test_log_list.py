@@ -108,8 +108,8 @@ def test_what_avtorch_wrote_in_a_folder_is_no_log(here: Path, scheduler: str) ->
     ("sources", "message"),
     [
         (["missing.csv"], "missing.csv: no such file"),
-        (["empty"], "empty: no log in this folder"),
-        (["*.mf4"], "matches no log"),
+        (["empty"], "empty: no log there"),
+        (["*.mf4"], "*.mf4: no log there"),
         ([], "logs: found none"),
         (["fleet.csv", "a.csv"], "fleet.csv: is a manifest; needs to be the only source"),
         (["nowhere://x/a.csv"], "nowhere://x/a.csv: cannot be reached"),

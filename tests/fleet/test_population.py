@@ -9,8 +9,9 @@ import pytest
 import torch
 from scipy import stats
 
-from avtorch.fleet.population import APART, SAMPLED, car_causes, drive_belief, fleet_causes, population
-from avtorch.fleet.siblings import left_out
+from avtorch.fleet.folder import drive_belief
+from avtorch.fleet.population import SAMPLED, left_out, population
+from avtorch.fleet.ranking import APART, car_causes, fleet_causes
 from avtorch.inference import PopulationMargin, sample
 from tests.bars import BAR
 

@@ -166,7 +166,7 @@ def test_drives_that_begin_their_time_anew_keep_their_own_rows(
     whole = replace(each[0], segment=np.repeat([0, 1, 2], rows), engaged=np.ones(sum(rows), bool), **columns)
     candidate = followed(whole, LAWS["constant_time_gap"])
     # the first is too short to be a drive
-    assert candidate.begins == (rows[0], rows[0] + rows[1])
+    assert candidate.data.source[candidate.data.bounds[:-1]].tolist() == [rows[0], rows[0] + rows[1]]
     for seen, log in zip(candidate.seen, each[1:], strict=True):
         np.testing.assert_array_equal(seen.spacing.numpy(), log.spacing)
 

@@ -166,7 +166,7 @@ def test_metrics_are_served_while_it_runs(here: Path, capsys: pytest.CaptureFixt
                 pages.append(page.read().decode())
 
     try:
-        watch_source(Lines(), watch, [], observers=[metrics])
+        watch_source(Lines(), watch, [], answered=metrics.answered)
     finally:
         metrics.close()
     found = dict(line.rsplit(" ", 1) for line in pages[0].splitlines() if not line.startswith("#"))
@@ -184,7 +184,7 @@ def test_metrics_are_served_while_it_runs(here: Path, capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["nothing.jsonl"], "nothing.jsonl: cannot be read (No such file or directory)"),
+        (["nothing.jsonl"], "nothing.jsonl: no such file"),
         (["."], ".: is a directory; a file of rows"),
         (["-", "--follow"], "--follow: has a meaning for a file of lines alone"),
         (["rows.jsonl", "--rate", "2"], "--rate: has a meaning for a recording alone"),

@@ -218,7 +218,6 @@ def test_what_is_kept_of_a_car_is_bounded():
         ({"cars": 0}, "cars"),
         ({"form": "other"}, "form"),
         ({"estimator": "other"}, "estimator"),
-        ({"detectors": ()}, "detectors"),
     ],
 )
 def test_settings_out_of_range_are_refused(given, named):

@@ -13,12 +13,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
 
 from avtorch.errors import InputError
-from avtorch.live import Counts, LineParser, LiveWatch, MqttAddress, MqttSink, MqttSource, Stop, watch_source
+from avtorch.live import Counts, LineParser, LiveWatch, MqttAddress, MqttSink, MqttSource, watch_source
 from tests.live.drives import fleet
 
 mqtt = pytest.importorskip("paho.mqtt.client")
@@ -78,7 +79,7 @@ def until(what: Any) -> None:
 @pytest.mark.slow
 def test_rows_in_answers_out(port: int) -> None:
     """Single rows, lists and lines; every fault counted exactly; a car named by its topic."""
-    counts, stop = Counts(), Stop()
+    counts, stop = Counts(), Event()
     watch = LiveWatch(counts=counts)
     source = MqttSource(MqttAddress.of(f"mqtt://127.0.0.1:{port}/cars/+"), LineParser(counts))
     sink = MqttSink(MqttAddress.of(f"mqtt://127.0.0.1:{port}/answers"), stop)
@@ -134,7 +135,7 @@ def test_it_survives_the_brokers_restart(tmp_path: Path) -> None:
     free.bind(("127.0.0.1", 0))
     port = free.getsockname()[1]
     free.close()
-    counts, stop = Counts(), Stop()
+    counts, stop = Counts(), Event()
     watch = LiveWatch(counts=counts)
     source = MqttSource(MqttAddress.of(f"mqtt://127.0.0.1:{port}/cars"), LineParser(counts))
     work = threading.Thread(target=watch_source, args=(source, watch, []), kwargs={"stop": stop})

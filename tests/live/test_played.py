@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
+from threading import Event
 
 import pytest
 from mcap_ros2.writer import Writer
@@ -14,7 +15,7 @@ from mcap_ros2.writer import Writer
 from avtorch import Log
 from avtorch.cli import main
 from avtorch.errors import InputError
-from avtorch.live import KeptCars, LineSink, LiveWatch, PlayedLog, Stop, watch_source
+from avtorch.live import KeptCars, LineSink, LiveWatch, PlayedLog, watch_source
 from tests.io.formats.test_bags import cdr, folder_of
 from tests.live.drives import drive
 
@@ -73,16 +74,16 @@ def test_it_goes_on_at_the_row_where_it_stopped(tmp_path: Path) -> None:
     path, told = parquet(tmp_path / "drive.parquet"), io.StringIO()
 
     class Ends:
-        def __init__(self, stop: Stop) -> None:
+        def __init__(self, stop: Event) -> None:
             self.stop = stop
 
         def answered(self, answer, car, seconds) -> None:
             self.stop.set()
 
     for _ in range(3):
-        watch, stop, source = LiveWatch(), Stop(), PlayedLog(path, rate=100.0)
+        watch, stop, source = LiveWatch(), Event(), PlayedLog(path, rate=100.0)
         kept = KeptCars(tmp_path / "state", source.identity)
-        watch_source(source, watch, [LineSink(told)], stop=stop, kept=kept, observers=[Ends(stop)])
+        watch_source(source, watch, [LineSink(told)], stop=stop, kept=kept, answered=Ends(stop).answered)
     whole = io.StringIO()
     watch_source(PlayedLog(path), LiveWatch(), [LineSink(whole)])
     assert told.getvalue().splitlines() == whole.getvalue().splitlines()[:2]
@@ -91,7 +92,7 @@ def test_it_goes_on_at_the_row_where_it_stopped(tmp_path: Path) -> None:
 
 def test_it_is_played_at_its_rate(tmp_path: Path) -> None:
     begun = time.monotonic()
-    rows = sum(len(batch.rows) for batch in PlayedLog(parquet(tmp_path / "d.parquet"), rate=20.0).batches(Stop()))
+    rows = sum(len(batch.rows) for batch in PlayedLog(parquet(tmp_path / "d.parquet"), rate=20.0).batches(Event()))
     assert rows == 300
     assert time.monotonic() - begun >= 5.98 / 20.0
 

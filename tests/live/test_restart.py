@@ -7,6 +7,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from threading import Event
 
 import pytest
 
@@ -20,7 +21,6 @@ from avtorch.live import (
     LineSink,
     LiveSettings,
     LiveWatch,
-    Stop,
     watch_source,
 )
 from tests.live.drives import fleet, lines
@@ -45,9 +45,9 @@ class Interrupted(Exception):
 
 
 class EndsAfter:
-    """An observer that ends the watch after so many windows: as Ctrl-C does, or as a crash."""
+    """Ends the watch after so many windows: as Ctrl-C does, or as a crash."""
 
-    def __init__(self, many: int, stop: Stop | None = None) -> None:
+    def __init__(self, many: int, stop: Event | None = None) -> None:
         self.left, self.stop = many, stop
 
     def answered(self, answer, car, seconds) -> None:
@@ -80,9 +80,9 @@ def test_stopped_again_and_again_it_writes_what_an_uncut_one_writes(tmp_path: Pa
     total, starts = 0, 0
     while total < 9:
         watch, source, kept = begin(tmp_path, settings)
-        stop = Stop()
+        stop = Event()
         sink = FileSink(out, resume=kept.same_source)
-        watch_source(source, watch, [sink], stop=stop, kept=kept, observers=[EndsAfter(1, stop)])
+        watch_source(source, watch, [sink], stop=stop, kept=kept, answered=EndsAfter(1, stop).answered)
         sink.close()
         total, starts = watch.counts.windows, starts + 1
         assert watch.counts.repeated == 0
@@ -102,7 +102,7 @@ def test_killed_it_writes_each_window_once(tmp_path: Path, monkeypatch: pytest.M
         watch, source, kept = begin(tmp_path, SETTINGS["map"])
         sink = FileSink(out, resume=kept.same_source)
         try:
-            watch_source(source, watch, [sink], kept=kept, observers=[EndsAfter(crash)])
+            watch_source(source, watch, [sink], kept=kept, answered=EndsAfter(crash).answered)
         except Interrupted:
             with out.open("a") as stream:
                 stream.write('{"car": "re')  # half a line
@@ -126,7 +126,7 @@ def test_a_file_is_followed_cut_and_replaced(tmp_path: Path) -> None:
     path = tmp_path / "rows.jsonl"
     path.write_bytes(text[:half])
     watch, source, _ = begin(tmp_path, SETTINGS["map"], follow=True)
-    rows, quiet, step, stop = [], 0, 0, Stop()
+    rows, quiet, step, stop = [], 0, 0, Event()
     for batch in source.batches(stop):
         rows += batch.rows
         quiet = 0 if batch.rows else quiet + 1
@@ -151,7 +151,7 @@ def test_a_file_is_followed_cut_and_replaced(tmp_path: Path) -> None:
 def test_a_file_that_takes_the_place_of_another_has_a_header_of_its_own(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
     path.write_text("time,accel_cmd,speed\n1,0.5,20\n")
-    parser, stop, rows = LineParser(Counts()), Stop(), []
+    parser, stop, rows = LineParser(Counts()), Event(), []
     source = FileSource(path, parser, follow=True)
     for batch in source.batches(stop):
         rows += batch.rows
@@ -168,7 +168,7 @@ def test_what_follows_is_read_by_a_header_below_empty_lines(tmp_path: Path) -> N
     text = "\n\ntime,accel_cmd,speed\n1,0.5,20\n"
     (tmp_path / "rows.csv").write_text(text + "2,0.5,20\n")
     source = FileSource(tmp_path / "rows.csv", LineParser(Counts()))
-    rows = [row for batch in source.batches(Stop(), len(text)) for row in batch.rows]
+    rows = [row for batch in source.batches(Event(), len(text)) for row in batch.rows]
     assert [row.time for row in rows] == [2.0]
 
 

@@ -78,5 +78,3 @@ def test_a_late_sensor_and_notes_of_what_bends() -> None:
 def test_wrong_arguments_are_refused() -> None:
     with pytest.raises(InputError, match="required"):
         what_to_set(plant(), _belief(1, 0.3, 1.0), required=1.5)
-    with pytest.raises(InputError, match="speeds"):
-        what_to_set(plant(), _belief(1, 0.3, 1.0), speeds=())
