@@ -8,17 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from avtorch.cli.arguments import (
-    OUTPUT,
-    Columns,
-    Json,
-    Open,
-    Quiet,
-    Units,
-    free_folder,
-    local_folder,
-    origin_of,
-)
+from avtorch.cli import arguments as arg
 from avtorch.cli.simulators import read_simulator, simulator_of, simulators_of
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError
@@ -64,13 +54,15 @@ def compare(
     ] = None,
     out: Annotated[
         Path | None,
-        Parameter(name="--out", group=OUTPUT, converter=local_folder, help="Folder for comparison.html and .json."),
+        Parameter(
+            name="--out", group=arg.OUTPUT, converter=arg.local_folder, help="Folder for comparison.html and .json."
+        ),
     ] = None,
-    map: Columns = None,
-    unit: Units = None,
-    open_page: Open = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    map: arg.Columns = None,
+    unit: arg.Units = None,
+    open_page: arg.Open = False,
+    json: arg.Json = False,
+    quiet: arg.Quiet = False,
 ) -> None:
     """Did a change to the car, or to the simulator, help? By how much, with intervals.
 
@@ -82,66 +74,52 @@ def compare(
         Logs, as for diagnose: the drive before the change and the one after it; with --after any number before it; with
         two simulators a single one.
     """
-    if out is not None:
-        free_folder(out)
-    elif open_page:
+    given = dict(locals())
+    if open_page and out is None:
         raise InputError("--open: found without --out; needs a folder for the page")
     two = [*(simulator or ()), *(simulated or ())]
     before, later = (logs, after) if after else (logs[:1], logs[1:])
     if len(later) > 1 and not after:
         raise InputError(f"LOGS: found {len(logs)}, needs two; with more, say --after before those after the change")
-    if not later:
+    if two and (baseline != "glvd" or baseline_after is not None):
+        raise InputError("--baseline: found beside --simulator or --simulated, needs the plant as --simulator")
+    talk = Talk(json=json, quiet=quiet)
+    found: Comparison | SimulatorComparison
+    if later:
+        if len(simulator or ()) > 1:
+            raise InputError(f"--simulator: found {len(two)} beside several logs, needs one, or one log")
+        base = read_simulator("--baseline", baseline)
+        other = None if baseline_after is None else read_simulator("--baseline-after", baseline_after)
+        if baseline_after is not None and (base is None or other is None):
+            needs = "needs --baseline and --baseline-after given"
+            raise InputError(f"--baseline-after: found without two simulators; {needs}")
+
+        from avtorch.gap.compare import compare as work
+
+        sides = [[_log(path, map, unit, talk) for path in paths] for paths in (before, later)]
+        read = [*sides[0], *sides[1]]
+        drives = list(zip([*before, *later], read, strict=True))
+        own = simulator_of(simulated or (), (simulator or (None,))[0], step, drives)
+        with talk.progress("Comparing") as step_done:
+            found = work(*sides, baseline=own or base, baseline_after=other, progress=step_done)
+    else:
         if not two:
-            raise InputError(
-                "AFTER: missing; needs a file, or two of --simulator and --simulated, see avtorch compare --help"
-            )
+            needs = "needs a file, or two of --simulator and --simulated, see avtorch compare --help"
+            raise InputError(f"AFTER: missing; {needs}")
         if len(two) != 2:
             raise InputError(f"--simulator, --simulated: found {len(two)} beside one log, needs two")
-        if baseline != "glvd" or baseline_after is not None:
-            raise InputError("--baseline: found beside --simulator or --simulated, needs a plant as --simulator")
-        talk = Talk(json=json, quiet=quiet)
-        log = _log(logs[0], map, unit, talk)
-        first, second = simulators_of(simulator or (), simulated or (), step, logs[0], log)
 
         from avtorch.external import compare_simulators
 
+        read = [_log(logs[0], map, unit, talk)]
+        first, second = simulators_of(simulator or (), simulated or (), step, logs[0], read[0])
         with talk.progress("Comparing") as step_done:
-            found = compare_simulators(log, first, second, progress=step_done)
-        files = [*logs, *_files([*two])]
-        origin = origin_of(files, map=map, unit=unit, simulator=simulator, simulated=simulated, step=step)
-        _answer(talk, found, out, [log], origin, open_page)
+            found = compare_simulators(read[0], first, second, progress=step_done)
         if not talk.json:
             for which in (x for x in (found.first, found.second) if x.notes):
                 talk.notes(which.name, which.notes)
-        return
-    if len(simulator or ()) > 1:
-        raise InputError(f"--simulator: found {len(two)} beside several logs, needs one, or one log")
-    if two and (baseline != "glvd" or baseline_after is not None):
-        raise InputError("--baseline: found beside --simulator or --simulated, needs one simulator")
-    base = read_simulator("--baseline", baseline)
-    other = None if baseline_after is None else read_simulator("--baseline-after", baseline_after)
-    if baseline_after is not None and (base is None or other is None):
-        raise InputError("--baseline-after: found without two simulators; needs --baseline and --baseline-after given")
-
-    from avtorch.gap.compare import compare as work
-
-    talk = Talk(json=json, quiet=quiet)
-    sides = [[_log(path, map, unit, talk) for path in paths] for paths in (before, later)]
-    read = [*sides[0], *sides[1]]
-    drives = list(zip([*before, *later], read, strict=True))
-    own = simulator_of(simulated or (), (simulator or (None,))[0], step, drives, adjust=(), rollouts=None, processes=1)
-    with talk.progress("Comparing") as step_done:
-        comparison = work(*sides, baseline=own or base, baseline_after=other, progress=step_done)
-    origin = origin_of(
-        [*before, *later, *_files([*two, baseline, baseline_after or ""])],
-        map=map,
-        unit=unit,
-        simulator=simulator,
-        simulated=simulated,
-        step=step,
-        baseline=[baseline, baseline_after],
-    )
-    _answer(talk, comparison, out, read, origin, open_page)
+    origin = arg.origin_of([*before, *later, *_files([*two, baseline, baseline_after or ""])], given)
+    _answer(talk, found, out, read, origin, open_page)
 
 
 def _files(sources: Sequence[str]) -> list[Path]:

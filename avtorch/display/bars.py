@@ -1,39 +1,40 @@
-"""Bars for two places: below a notebook's cell, as HTML that is updated in place, and on a terminal."""
+"""Bars for three places: below a notebook's cell, as HTML that is updated in place, on a terminal, and in lines."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from html import escape
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from avtorch.display.notebook import notebook_display
 
-
-class Bar(Protocol):
-    """Shows `text` and the `share` that is done, 0 to 1; closed, it is gone."""
-
-    def show(self, text: str, share: float) -> None: ...
-
-    def close(self) -> None: ...
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
-class NoBar:
-    """Where there is no place for one."""
+class Bar:
+    """Where there is no place for one: shows nothing.
 
-    def show(self, text: str, share: float) -> None:
+    `show` takes the work's `title`, its stage `what` or "", the `share` that is done, 0 to 1, and the time left [s],
+    None where it is not known. Closed, the bar is gone.
+    """
+
+    def show(self, title: str, what: str, share: float, left_s: float | None) -> None:
         pass
 
     def close(self) -> None:
         pass
 
 
-class NotebookBar:
+class NotebookBar(Bar):
     """One output of the cell; closed, it is empty: a notebook cannot take back a single output."""
 
     def __init__(self, display: Any) -> None:
         self._display, self._output = display, None
 
-    def show(self, text: str, share: float) -> None:
+    def show(self, title: str, what: str, share: float, left_s: float | None) -> None:
+        text = _text(title, what, left_s)
         html = f'<progress max="1" value="{share:.3f}" aria-label="{escape(text)}"></progress> {escape(text)}'
         self._put({"text/html": html, "text/plain": f"{share:.0%} {text}"})
 
@@ -48,28 +49,42 @@ class NotebookBar:
             self._output.update(data, raw=True)
 
 
-class TerminalBar:
-    """A line on standard error."""
+class TerminalBar(Bar):
+    """A line on the terminal that is updated in place."""
 
-    def __init__(self) -> None:
-        self._bar, self._task = None, None
-
-    def show(self, text: str, share: float) -> None:
-        from rich.markup import escape as plain
+    def __init__(self, console: Console) -> None:
         from rich.progress import BarColumn, Progress, TextColumn
 
-        if self._bar is None:
-            from rich.console import Console
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))
+        self._bar = Progress(*columns, console=console, transient=True)
+        self._task = self._bar.add_task("", total=1.0)
 
-            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))
-            self._bar = Progress(*columns, console=Console(file=sys.stderr), transient=True)
-            self._task = self._bar.add_task("", total=1.0)
-            self._bar.start()
-        self._bar.update(self._task, description=plain(text), completed=share)  # type: ignore[arg-type]
+    def show(self, title: str, what: str, share: float, left_s: float | None) -> None:
+        from rich.markup import escape as plain
+
+        self._bar.start()
+        self._bar.update(self._task, description=plain(_text(title, what, left_s)), completed=share)
 
     def close(self) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+        self._bar.stop()
+
+
+class Lines(Bar):
+    """Lines by `tell`, of the share that is done, and of what comes before anything is done and tells its own time."""
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell = tell
+
+    def show(self, title: str, what: str, share: float, left_s: float | None) -> None:
+        if left_s is not None:
+            self._tell(f"{title}: {100 * share:.0f} %, about {left_s:.0f} s left{what and f' ({what})'}")
+        elif share == 0 and "," in what:
+            self._tell(f"{title}: {what}")
+
+
+def _text(title: str, what: str, left_s: float | None) -> str:
+    text = f"{title}: {what}" if what else title
+    return text if left_s is None else f"{text}, about {left_s:.0f} s left"
 
 
 def bar_here() -> Bar:
@@ -77,4 +92,8 @@ def bar_here() -> Bar:
     display = notebook_display()
     if display is not None:
         return NotebookBar(display)
-    return TerminalBar() if sys.stderr.isatty() else NoBar()
+    if not sys.stderr.isatty():
+        return Bar()
+    from rich.console import Console
+
+    return TerminalBar(Console(file=sys.stderr))

@@ -17,7 +17,7 @@ from contextvars import ContextVar
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
-from avtorch.display.bars import Bar, NoBar, bar_here
+from avtorch.display.bars import Bar, bar_here
 from avtorch.display.notebook import notebook_display
 from avtorch.threads import one_thread
 
@@ -27,28 +27,36 @@ _EVERY_S = 0.2
 
 P = ParamSpec("P")
 R = TypeVar("R")
-Steps = TypeVar("Steps", bound=Callable[..., None])
+Called = TypeVar("Called", bound=Callable[..., None])
 
 _shown: ContextVar[bool] = ContextVar("avtorch_progress_bar", default=False)
 
 
-class _Steps:
-    """Called with (done, of), or (what, done, of) where there are stages; shows them on a bar now and then."""
+class Steps:
+    """Called with (done, of), or (what, done, of) where there are stages; shows them on a bar every `every_s` [s].
 
-    def __init__(self, title: str, bar: Bar) -> None:
+    What comes before anything is done, such as a simulator that is driven first, tells its own time after a comma: that
+    is shown as it begins, and the time left is counted from its end.
+    """
+
+    def __init__(self, title: str, bar: Bar, every_s: float | None = None) -> None:
         self._title, self._bar = title, bar
-        self._begun, self._last = time.monotonic(), 0.0
+        self._every_s = _EVERY_S if every_s is None else every_s
+        self._begun = self._last = time.monotonic()
+        self._first = ""
 
     def __call__(self, *told: Any) -> None:
         *stage, done, of = told
-        now = time.monotonic()
-        if now - self._begun < AFTER_S or now - self._last < _EVERY_S:
+        what, now = stage[0] if stage else "", time.monotonic()
+        if done == 0:
+            self._begun = now
+        if done == 0 and "," in what and what != self._first:
+            self._first = what
+        elif now - self._begun < AFTER_S or now - self._last < self._every_s:
             return
         self._last = now
-        text = ": ".join([self._title, *stage])
-        if 0 < done < of:
-            text += f", about {(now - self._begun) * (of - done) / done:.0f} s left"
-        self._bar.show(text, min(done / of, 1.0) if of > 0 else 0.0)
+        left_s = (now - self._begun) * (of - done) / done if 0 < done < of else None
+        self._bar.show(self._title, what, min(done / of, 1.0) if of > 0 else 0.0, left_s)
 
 
 @contextmanager
@@ -58,10 +66,10 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
     It stands below the cell in a notebook, and on standard error where that is a terminal. Elsewhere, within another
     bar and in the first second there is none. At the end it is gone.
     """
-    bar = NoBar() if _shown.get() else bar_here()
+    bar = Bar() if _shown.get() else bar_here()
     token = _shown.set(True)
     try:
-        yield _Steps(title, bar)
+        yield Steps(title, bar)
     finally:
         _shown.reset(token)
         bar.close()
@@ -87,6 +95,6 @@ def shows_progress(function: Callable[P, R]) -> Callable[P, R]:
     return inner
 
 
-def called(progress: Steps | bool | None) -> Steps | None:
+def called(progress: Called | bool | None) -> Called | None:
     """`progress` of a function behind `shows_progress`, where it is a callback; otherwise None."""
     return None if isinstance(progress, bool) else progress

@@ -17,7 +17,7 @@ import pytest
 from rich.console import Console
 
 from avtorch.cli import main
-from avtorch.cli.follower import print_diagnosis
+from avtorch.cli.diagnose import print_diagnosis
 from avtorch.cli.talk import Talk, drawn
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, DeadTime, GapPlant, plant
