@@ -10,14 +10,13 @@ from cyclopts import Parameter
 
 from avtorch.cli import arguments as arg
 from avtorch.cli.simulators import read_simulator, simulator_of, simulators_of
-from avtorch.cli.talk import Talk
+from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
     from avtorch.external import SimulatorComparison
     from avtorch.gap.result.comparison import Comparison
     from avtorch.io import Log
-    from avtorch.report import Origin
 
 PAGE = "comparison.html"
 
@@ -115,11 +114,27 @@ def compare(
         first, second = simulators_of(simulator or (), simulated or (), step, logs[0], read[0])
         with talk.progress("Comparing") as step_done:
             found = compare_simulators(read[0], first, second, progress=step_done)
-        if not talk.json:
-            for which in (x for x in (found.first, found.second) if x.notes):
-                talk.notes(which.name, which.notes)
-    origin = arg.origin_of([*before, *later, *_files([*two, baseline, baseline_after or ""])], given)
-    _answer(talk, found, out, read, origin, open_page)
+        for which in (x for x in (found.first, found.second) if x.notes):
+            talk.notes(which.name, which.notes)
+
+    from avtorch.io import check
+    from avtorch.report import comparison_html
+    from avtorch.report.comparison import comparison_tables
+
+    if out is not None:
+        notes = [f"{log.name}: {note}" for log in read for note in check(log).notes]
+        origin = arg.origin_of([*before, *later, *_files([*two, baseline, baseline_after or ""])], given)
+        pages = {PAGE: lambda: comparison_html(found, notes=notes, origin=origin)}
+        write_answer(out, "comparison.json", found.to_dict(), pages=pages)
+        if open_page:
+            talk.show(out / PAGE)
+    talk.lines([found.why, ""], "bold")
+    for table in () if talk.silent else comparison_tables(found):
+        talk.table(table)
+    if out is not None:
+        talk.done(out, found.to_dict(), [PAGE, "comparison.json"])
+    elif talk.json:
+        talk.answer(found.to_dict())
 
 
 def _files(sources: Sequence[str]) -> list[Path]:
@@ -136,33 +151,3 @@ def _log(path: Path, map: list[str] | None, unit: list[str] | None, talk: Talk) 
     require_usable(log)
     talk.notes(log.name, check(log).notes)
     return log
-
-
-def _answer(
-    talk: Talk,
-    found: Comparison | SimulatorComparison,
-    out: Path | None,
-    logs: Sequence[Log],
-    origin: Origin,
-    open_page: bool,
-) -> None:
-    from avtorch.io import answer_set, check, write_json
-    from avtorch.report.comparison import comparison_tables
-
-    if out is not None:
-        from avtorch.report import comparison_html
-        from avtorch.report.page import written
-
-        notes = [f"{log.name}: {note}" for log in logs for note in check(log).notes]
-        with answer_set(out, ("comparison.json", PAGE)) as staged:
-            written(comparison_html(found, notes=notes, origin=origin), staged, PAGE)
-            write_json(staged / "comparison.json", found.to_dict())
-        if open_page:
-            talk.show(out / PAGE)
-    talk.lines([found.why, ""], "bold")
-    for table in () if talk.silent else comparison_tables(found):
-        talk.table(table)
-    if out is not None:
-        talk.done(out, found.to_dict(), [PAGE, "comparison.json"])
-    elif talk.json:
-        talk.answer(found.to_dict())

@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from difflib import get_close_matches
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -355,28 +354,23 @@ def _limits(drives: Sequence[Log], given: Mapping[str, float | None]) -> Limits:
     return limits
 
 
-def _known(option: str, name: str, more: Sequence[str] = ()) -> str:
-    from avtorch.gap import EFFECTS
-
-    if name not in EFFECTS and name not in more:
-        near = get_close_matches(name[:60], [*EFFECTS, *more], n=1) or [x for x in EFFECTS if name and name in x]
-        hint = f"; perhaps {near[0]}" if near else f", such as {', '.join(sorted(EFFECTS)[:3])}"
-        needs = "".join(f"{x}, " for x in more) + ("or " if more else "")
-        raise InputError(f"{option}: found {quoted(name)}, needs {needs}an effect's name{hint}")
-    return name
-
-
 def chosen_effects(text: str | None) -> list[str] | None:
     """The effects of `--effects`, None for all. Raises `InputError` for a name that is not known or comes twice."""
     if text is None:
         return None
-    names = [_known("--effects", part.strip()) for part in text.split(",")]
-    if len(set(names)) < len(names):
-        raise InputError(f"--effects: found {quoted(text)}, needs each name once")
+    from avtorch.gap.simulator.effect import chosen_effects as known
+
+    names = [part.strip() for part in text.split(",")]
+    try:
+        known(names)
+    except InputError as fault:
+        raise InputError(f"--effects: {str(fault).partition(': ')[2]}") from None
     return names
 
 
 def _prior(given: Sequence[str]) -> dict[str, float]:
+    from avtorch.gap import effect_class
+
     weights: dict[str, float] = {}
     for item in given:
         name, equals, value = (x.strip() for x in item.partition("="))
@@ -388,7 +382,12 @@ def _prior(given: Sequence[str]) -> dict[str, float]:
             raise InputError(
                 f"--prior: found {quoted(item)}, needs NAME=WEIGHT with a number of 0 or more, such as none=5"
             )
-        if _known("--prior", name, CAUSES) in weights:
+        if name not in CAUSES:
+            try:
+                effect_class(name)
+            except InputError as fault:
+                raise InputError(f"--prior: {str(fault).partition(': ')[2]}, or {', '.join(CAUSES)}") from None
+        if name in weights:
             raise InputError(f"--prior: found {name} twice, needs each name once")
         weights[name] = weight
     return weights
@@ -427,32 +426,24 @@ def read_alarms(paths: Sequence[Path], logs: Sequence[Log]) -> tuple[Alarm, ...]
     return tuple(
         alarm
         for number, (path, log) in enumerate(zip(paths, logs, strict=True))
-        for alarm in _alarms(_answer(path), path, log, number)
+        for alarm in _alarms(path, log, number)
     )
 
 
-def _answer(path: Path) -> Mapping[str, Any]:
+def _alarms(path: Path, log: Log, number: int) -> list[Alarm]:
+    from avtorch.gap.result.traces import Alarm
     from avtorch.io.opening import place, read_regular
 
     try:
-        found = json.loads(read_regular(path, most=_MOST_BYTES, need=_NEED).decode("utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as fault:
-        raise InputError(f"{place(path)}: is no JSON, needs {_NEED}") from fault
-    schema = found.get("schema") if isinstance(found, dict) else None
-    if schema != "avtorch.estimates/1":
-        raise InputError(f"{place(path)}: found {quoted(str(schema))} as its schema, needs {_NEED}")
-    return found
-
-
-def _alarms(answer: Mapping[str, Any], path: Path, log: Log, number: int) -> list[Alarm]:
-    from avtorch.gap.result.traces import Alarm
-    from avtorch.io.opening import place
-
-    try:
+        answer = json.loads(read_regular(path, most=_MOST_BYTES, need=_NEED).decode("utf-8"))
+        if answer["schema"] != "avtorch.estimates/1":
+            raise InputError(f"{place(path)}: found {quoted(str(answer['schema']))} as its schema, needs {_NEED}")
         rows, epoch = int(answer["quality"]["rows"]), float(answer["epoch_s"])
         windows = [(float(w["end_s"]), frozenset(map(str, w["alerts"]))) for w in answer["windows"]]
-    except (KeyError, TypeError, ValueError) as fault:
-        raise InputError(f"{place(path)}: is damaged, needs {_NEED}") from fault
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, RecursionError) as fault:
+        raise InputError(f"{place(path)}: is damaged or another file, needs {_NEED}") from fault
     if rows != log.rows or abs(epoch - log.epoch_s) > 1e-3:
         raise InputError(
             f"{place(path)}: is of a log of {rows} rows that begins at {epoch:.10g} s, needs the estimates of "

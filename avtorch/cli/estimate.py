@@ -104,30 +104,31 @@ def estimate(
 
     from avtorch import plots
     from avtorch.report import estimates_html
-    from avtorch.report.estimates import dead_time_note, estimates_note, late_note
-    from avtorch.report.page import written
-    from avtorch.report.window_tables import P_WORDS, alert_table, window_table
+    from avtorch.report.estimates import (
+        P_WORDS,
+        alert_table,
+        dead_time_note,
+        estimates_note,
+        late_note,
+        window_table,
+    )
 
     origin = arg.origin_of([log], given)
     notes = () if fit is None else (about_map,)
-
-    def page(staged: Path) -> None:
-        write_pedals(fit, staged)
-        written(estimates_html(found, drive, notes=notes, origin=origin), staged, PAGE)
-
     pictures = {
         "belief.png": lambda: plots.belief_figure(answer["windows"], answer=answer, log=drive),
         "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
     }
-    write_answer(out, "estimates.json", answer, pictures, more=page, also=(PAGE, *PEDAL_FILES))
+    pages = {PAGE: lambda: estimates_html(found, drive, notes=notes, origin=origin)}
+    pedals = lambda staged: write_pedals(fit, staged)  # noqa: E731
+    write_answer(out, "estimates.json", answer, pictures, pages, more=pedals, also=PEDAL_FILES)
     if open_page:
         talk.show(out / PAGE)
     printed = answer | {key: from_start(answer[key], answer["epoch_s"]) for key in ("windows", "alerts")}
     talk.table(window_table(printed["windows"]), most=60)
     talk.lines([P_WORDS], "dim")
     talk.lines([estimates_note(answer)])
-    if printed["alerts"]:
-        talk.table(alert_table(printed["alerts"]))
+    talk.table(alert_table(printed["alerts"]))
     more = (late_note(found.late), dead_time_note(found.inferred), answer["estimator_note"])
     talk.lines([text for text in more if text])
     talk.done(out, answer)

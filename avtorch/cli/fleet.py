@@ -95,6 +95,7 @@ def fleet(
 
     from avtorch.fleet import FleetSettings, find_logs, run_fleet
     from avtorch.report import Origin, write_fleet_page
+    from avtorch.report.fleet import many
 
     page = None
     if reports:
@@ -121,7 +122,7 @@ def fleet(
     talk = Talk(json=json, quiet=quiet)
     found = find_logs(logs, leave_out=out)
     cars = len({log.car for log in found.logs})
-    talk.line(f"{_many(len(found.logs), 'log')} of {_many(cars, 'car')}, {_CAR_FROM[found.car_from]}")
+    talk.line(f"{many(len(found.logs), 'log')} of {many(cars, 'car')}, {_CAR_FROM[found.car_from]}")
 
     def tell(cluster: Cluster) -> None:
         if cluster.dashboard is not None:
@@ -172,23 +173,19 @@ def chosen_steps(text: str | None) -> tuple[Step, ...]:
     return tuple(step for step in STEPS if step in names)
 
 
-def _many(count: int, word: str) -> str:
-    return f"{count} {word}{'s' if count != 1 else ''}"
-
-
 def _print(talk: Talk, answer: dict[str, Any]) -> None:
     """The first cars, in the order in which to look at them, and what failed."""
-    from avtorch.report.fleet import failure_table, ranking_table
+    from avtorch.report.fleet import failure_table, many, ranking_table
 
     if talk.silent:
         return
     talk.table(ranking_table(answer["cars"]), most=SHOWN)
-    failures = failure_table(answer)
-    for place, _, _, why in () if failures is None else failures.rows[:5]:
+    failures = failure_table(answer).rows
+    for place, _, _, why in failures[:5]:
         talk.line(f"Failed: {why if place in why or os.path.basename(place) in why else f'{place}: {why}'}")
-    if failures is not None and len(failures.rows) > 5:
-        talk.line(f"... and {_many(len(failures.rows) - 5, 'more log')} failed, see fleet.json")
+    if len(failures) > 5:
+        talk.line(f"... and {many(len(failures) - 5, 'more log')} failed, see fleet.json")
     for note in answer["notes"]:
         talk.line(note)
     done = answer["work"]
-    talk.line(f"\n{_many(done['computed'], 'answer')} computed, {done['kept']} kept from earlier runs.")
+    talk.line(f"\n{many(done['computed'], 'answer')} computed, {done['kept']} kept from earlier runs.")

@@ -81,7 +81,7 @@ def rows_table(answer: Mapping[str, Any]) -> Table:
     from avtorch.report.table import Table
 
     rows = [
-        (f"{row['quantity']}\n{row['setting']}", formatted(row["paper"]), here(row), row["verdict"])
+        (f"{row['quantity']} ({row['setting']})", formatted(row["paper"]), here(row), row["verdict"])
         for row in answer["rows"]
     ]
     soft = [i for i, row in enumerate(answer["rows"]) if row["verdict"] == "not reproduced"]

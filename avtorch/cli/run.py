@@ -95,12 +95,8 @@ def run(
     talk = Talk(json=json, quiet=quiet)
     with talk.progress("Driving") as step:
         supervisor = Supervisor(fresh(), window=window, strategist=_strategist(strategy, controller), seed=seed)
-        acting = supervisor.run(
-            seconds,
-            events=[(change_at, change)],
-            progress=lambda done: step(done, (1 if strategy == "none" else 2) * seconds),
-        )
-        alone = acting.rows if strategy == "none" else _unwatched(fresh(), seconds, change_at, change, step)
+        acting = supervisor.run(seconds, events=[(change_at, change)], progress=lambda done: step(done, seconds))
+        alone = acting.rows if strategy == "none" else _unwatched(fresh(), seconds, change_at, change)
 
     from avtorch.results import run_answer
 
@@ -137,24 +133,14 @@ def _strategist(strategy: str, controller: str) -> Strategist | None:
     return Strategist(Grid(allowed=ALLOWED[strategy]))
 
 
-def _unwatched(
-    loop: ClosedLoop,
-    seconds: float,
-    change_at: float,
-    change: Callable[[ClosedLoop], None],
-    step: Callable[[float, float], None],
-) -> Block:
-    """The same drive without a monitor, in blocks so that the progress bar moves."""
+def _unwatched(loop: ClosedLoop, seconds: float, change_at: float, change: Callable[[ClosedLoop], None]) -> Block:
+    """The same drive without a monitor."""
     from avtorch.vehicle import Block
 
-    end, turn, blocks = round(seconds / loop.dt), round(change_at / loop.dt), []
-    while loop.steps_done < end:
-        if loop.steps_done == turn:
-            change(loop)
-        until = turn if loop.steps_done < turn else end
-        blocks.append(loop.advance(min(500, until - loop.steps_done)))
-        step(seconds + loop.time, 2 * seconds)
-    return Block.concatenate(blocks)
+    turn = round(change_at / loop.dt)
+    before = [loop.advance(turn)] if turn else []
+    change(loop)
+    return Block.concatenate([*before, loop.advance(round(seconds / loop.dt) - turn)])
 
 
 def _write(
@@ -170,7 +156,6 @@ def _write(
 ) -> None:
     from avtorch import plots
     from avtorch.report import run_html
-    from avtorch.report.page import written
     from avtorch.report.run import Regions
 
     time, rows = acting.rows.time, acting.rows
@@ -190,19 +175,14 @@ def _write(
         "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
         "region.png": lambda: plots.region_figure(settings, clouds, truth=vehicle),
     }
-    regions = Regions(settings, clouds)
-
-    def page(staged: Path) -> None:
-        html = run_html(answer, time, traces, truth=truth, bounds=BOUNDS, regions=regions, origin=origin)
-        written(html, staged, PAGE)
-
-    write_answer(out, "run.json", answer, pictures, more=page, also=(PAGE,))
+    more: Any = {"truth": truth, "bounds": BOUNDS, "regions": Regions(settings, clouds), "origin": origin}
+    write_answer(out, "run.json", answer, pictures, {PAGE: lambda: run_html(answer, time, traces, **more)})
 
 
 def _print(talk: Talk, answer: dict[str, Any]) -> None:
     """The events of a run in order, its windows, and how much the action helped."""
+    from avtorch.report.estimates import P_WORDS, window_table
     from avtorch.report.run import collision, performance_table, story_table
-    from avtorch.report.window_tables import P_WORDS, window_table
 
     talk.table(window_table(answer["windows"]), most=60)
     talk.lines([P_WORDS, ""], "dim")

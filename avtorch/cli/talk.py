@@ -15,8 +15,6 @@ from rich.markup import escape
 from rich.segment import Segment
 from rich.table import Table as Drawn
 
-from avtorch.display.bars import Lines, TerminalBar
-from avtorch.display.progress import Steps
 from avtorch.errors import printable
 
 if TYPE_CHECKING:
@@ -54,6 +52,9 @@ class Talk:
     def progress(self, what: str) -> Iterator[Callable[..., None]]:
         """A bar with the time left on stderr where it is a terminal, and a line now and then where it is not; yields a
         function of (done, of), or of (stage, done, of) where there are stages."""
+        # not before a command works: the package needs NumPy
+        from avtorch.display.progress import Lines, Steps, TerminalBar
+
         terminal = self.err.is_terminal and not self.silent
         lines = Lines(lambda text: self.err.print(text, markup=False, soft_wrap=True))
         bar = TerminalBar(self.err) if terminal else lines
@@ -88,7 +89,9 @@ class Talk:
             self.out.print(line, style=style, markup=False)
 
     def table(self, table: Table, most: int | None = None) -> None:
-        """A table of the page, `most` rows of it, and an empty line."""
+        """A table of the page, `most` rows of it, and an empty line; nothing of one without rows."""
+        if not table.rows:
+            return
         self.out.print(drawn(table, most))
         more = 0 if most is None else len(table.rows) - most
         if more > 0:
@@ -155,18 +158,23 @@ def write_answer(
     out: Path,
     name: str,
     answer: Mapping[str, Any],
-    pictures: Mapping[str, Callable[[], Any]],
+    pictures: Mapping[str, Callable[[], Any]] | None = None,
+    pages: Mapping[str, Callable[[], str]] | None = None,
     *,
     more: Callable[[Path], object] = lambda staged: None,
     also: Sequence[str] = (),
 ) -> None:
-    """Publish the answer and its pictures as one set; `more` writes further files into it, out of `also`, the files
-    that an earlier answer of this kind may have left."""
+    """Publish the answer, its pictures and its pages as one set; `more` writes further files into it, out of `also`,
+    the files that an earlier answer of this kind may have left."""
     from avtorch.io import answer_set, write_json
     from avtorch.plots import save
+    from avtorch.report.page import written
 
-    with answer_set(out, list(dict.fromkeys([name, *pictures, *also]))) as staged:
+    pictures, pages = pictures or {}, pages or {}
+    with answer_set(out, list(dict.fromkeys([name, *pictures, *pages, *also]))) as staged:
         for file, draw in pictures.items():
             save(draw(), staged / file)
+        for file, page in pages.items():
+            written(page(), staged, file)
         more(staged)
         write_json(staged / name, answer)

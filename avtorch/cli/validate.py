@@ -86,7 +86,7 @@ def validate(
     from avtorch.validation.validate import check_installed
 
     check_installed()
-    from avtorch.io import Log, answer_set, check
+    from avtorch.io import Log, check
     from avtorch.results import validation_answer
     from avtorch.validation import synthetic_windows, windows_of_log
     from avtorch.validation import validate as work
@@ -106,14 +106,13 @@ def validate(
     origin = arg.origin_of([] if log is None else [log], arguments)
 
     from avtorch import plots
-    from avtorch.report.page import written
     from avtorch.report.validation import validation_html, validation_notes, validation_table
 
     groups = found.to_arviz()
-    with answer_set(out, ("validation.json", PAGE, *plots.VALIDATION_PICTURES, *EXPORTS)) as staged:
-        export(staged, groups)
-        written(validation_html(found, origin=origin), staged, PAGE)
-        write_answer(staged, "validation.json", answer, plots.validation_figures(found))
+    pages = {PAGE: lambda: validation_html(found, origin=origin)}
+    files = (*plots.VALIDATION_PICTURES, *EXPORTS)
+    nets = lambda staged: export(staged, groups)  # noqa: E731
+    write_answer(out, "validation.json", answer, plots.validation_figures(found), pages, more=nets, also=files)
     if open_page:
         talk.show(out / PAGE)
     talk.table(validation_table(answer))

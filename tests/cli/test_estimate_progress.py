@@ -11,7 +11,6 @@ from avtorch import GLVDPlant, Leader, estimate, simulate
 from avtorch.cli.estimate import LINES as NAME
 from avtorch.cli.estimate import finished_windows
 from avtorch.display import progress
-from avtorch.display.bars import Lines
 from avtorch.errors import InputError
 from avtorch.results import window_entry
 
@@ -55,7 +54,7 @@ def lines(title: str, calls: list[tuple], times: list[float], monkeypatch: pytes
     """What is printed, every 10 s at most, of calls at these times after the beginning."""
     clock, said = iter([0.0, *times]), []
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
-    step = progress.Steps(title, Lines(said.append), 10.0)
+    step = progress.Steps(title, progress.Lines(said.append), 10.0)
     for told in calls:
         step(*told)
     return said
