@@ -42,37 +42,27 @@ if TYPE_CHECKING:
     )
 
 _HOME = {
-    "avtorch": ("decision", "gap", "inference", "io", "plots", "validation", "vehicle"),
-    "avtorch.decision.algorithm2": ("algorithm2",),
-    "avtorch.decision.estimation": ("Estimates", "estimate"),
-    "avtorch.decision.monitor": ("Monitor",),
-    "avtorch.decision.settings": ("Setting",),
-    "avtorch.decision.strategist": ("Strategist",),
-    "avtorch.decision.supervisor": ("Supervisor",),
-    "avtorch.errors": ("InputError",),
-    "avtorch.external.compare_simulators": ("compare_simulators",),
-    "avtorch.external.external_simulator": ("ExternalSimulator",),
-    "avtorch.gap.compare": ("compare",),
-    "avtorch.gap.diagnose": ("diagnose",),
-    "avtorch.gap.result.diagnosis": ("Diagnosis",),
-    "avtorch.inference": ("SGLD", "BeliefStream", "SequentialInference"),
-    "avtorch.io": ("Log",),
-    "avtorch.logcheck.check": ("LogCheck", "check"),
-    "avtorch.validation": ("Validation", "validate"),
-    "avtorch.vehicle": (
-        "GLVD",
-        "MPC",
-        "ClosedLoop",
-        "GLVDPlant",
-        "Leader",
-        "LinearController",
-        "LowerLevel",
-        "performance",
-        "simulate",
-        "stability",
-    ),
+    "avtorch": "decision gap inference io plots validation vehicle",
+    "avtorch.decision.algorithm2": "algorithm2",
+    "avtorch.decision.estimation": "Estimates estimate",
+    "avtorch.decision.monitor": "Monitor",
+    "avtorch.decision.settings": "Setting",
+    "avtorch.decision.strategist": "Strategist",
+    "avtorch.decision.supervisor": "Supervisor",
+    "avtorch.errors": "InputError",
+    "avtorch.external.compare_simulators": "compare_simulators",
+    "avtorch.external.external_simulator": "ExternalSimulator",
+    "avtorch.gap.compare": "compare",
+    "avtorch.gap.diagnose": "diagnose",
+    "avtorch.gap.result.diagnosis": "Diagnosis",
+    "avtorch.inference": "SGLD BeliefStream SequentialInference",
+    "avtorch.io": "Log",
+    "avtorch.logcheck.check": "LogCheck check",
+    "avtorch.validation": "Validation validate",
+    "avtorch.vehicle": "GLVD MPC ClosedLoop GLVDPlant Leader LinearController LowerLevel "
+    "performance simulate stability",
 }
-_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names.split()}
 
 __all__ = [
     "GLVD",

@@ -51,20 +51,24 @@ def window_entry(watched: WatchedWindow, scenario: int = 0) -> dict[str, Any]:
     """
     window, belief = watched.window, watched.window.belief
     excited, converged = bool(belief.excited[scenario]), bool(belief.converged[scenario])
-    stats = {name: belief.stat(name, scenario) for name in belief.names}
-    actuation = {name: stats.pop(name) for name in ("T_L", "K_L")}
-    noise = stats if "sigma" in stats else {"noise": stats}
     return {
         "start_s": _seconds(window.start_s),
         "end_s": _seconds(window.end_s),
         "n": int(window.n[scenario]),
         "excited": excited,
         "used": excited and converged,
-        **actuation,
-        **noise,
+        **_by_kind({name: belief.stat(name, scenario) for name in belief.names}),
         "alerts": watched.report.names(scenario),
         "p_string_stable": float(watched.report.p_string_stable[scenario]),
     }
+
+
+def _by_kind(stats: Mapping[str, Any]) -> dict[str, Any]:
+    """Lag and gain, then sigma, or in the latent form `noise` with its own parameters."""
+    if "sigma" in stats:
+        return dict(stats)
+    actuation = {name: stats[name] for name in ("T_L", "K_L")}
+    return {**actuation, "noise": {name: stat for name, stat in stats.items() if name not in actuation}}
 
 
 def alert_entries(watched: Sequence[WatchedWindow], scenario: int = 0) -> list[dict[str, Any]]:
@@ -279,12 +283,8 @@ def _method_entries(
     entries = []
     for row, number in enumerate(numbers):
         stats = {name: {key: finite(table[key][row][i]) for key in table} for i, name in enumerate(found.names)}
-        actuation = {name: stats.pop(name) for name in ("T_L", "K_L")}
-        noise = stats if "sigma" in stats else {"noise": stats}
-        converged = bool(found.converged[row])
-        entries.append(
-            {"window": number, "method": method, **actuation, **noise, "seconds": seconds[method], "settled": converged}
-        )
+        more = {"seconds": seconds[method], "settled": bool(found.converged[row])}
+        entries.append({"window": number, "method": method, **_by_kind(stats), **more})
     return entries
 
 

@@ -49,7 +49,7 @@ SLOW = frozenset(
         "avtorch.paper.strategies.Strategies",
         "avtorch.paper.strategies.strategies",
         "avtorch.plots.paper.paper_pictures",
-        "avtorch.plots.posterior_figures.validation_figures",
+        "avtorch.plots.posteriors.validation_figures",
         "avtorch.plots.signatures.signature_figure",
         "avtorch.plots.drive.diagnosis_figure",
         "avtorch.remedy.what_to_set.setting_for",

@@ -15,7 +15,7 @@ from avtorch.plots import PAPER_PICTURES, VALIDATION_PICTURES
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
 # Figures that are reached by a dict of them, from `paper_pictures` and `validation_figures`: there by file.
-BY_FILE = ("paper.py", "posterior_figures.py")
+BY_FILE = ("paper.py", "posteriors.py")
 
 
 def code() -> ast.Module:

@@ -18,7 +18,9 @@ from matplotlib.figure import Figure
 from avtorch import plots
 from avtorch.errors import InputError
 from avtorch.io import Log
+from avtorch.plots.plane import setting_region, verdict_map
 from avtorch.plots.style import AMPLIFIES, STABLE, UNSTABLE
+from avtorch.plots.time import belief_band, data_quality, events, motion, string_probability
 from avtorch.vehicle import stability
 
 
@@ -63,13 +65,13 @@ def test_every_drawing_returns_the_axes_it_was_given() -> None:
     curve = stability.gain(omega, 1.5, 0.5, 1.0, (1.5, 1.5, -0.8))
     plane = stability.region(("T", torch.linspace(0.1, 2, 21)), ("K", torch.linspace(0.2, 1.3, 11)))
     draw = [
-        lambda ax: plots.motion(ax, TIME, TRACES["speed"]),
-        lambda ax: plots.belief_band(ax, WINDOWS, "T_L", truth=TRUTH["T_L"], bounds=(0.1, 0.4)),
-        lambda ax: plots.string_probability(ax, WINDOWS),
-        lambda ax: plots.events(ax, change_s=1.0, alerts=ANSWER["alerts"], actions=ANSWER["actions"]),
-        lambda ax: plots.data_quality(ax, log(), WINDOWS),
+        lambda ax: motion(ax, TIME, TRACES["speed"]),
+        lambda ax: belief_band(ax, WINDOWS, "T_L", truth=TRUTH["T_L"], bounds=(0.1, 0.4)),
+        lambda ax: string_probability(ax, WINDOWS),
+        lambda ax: events(ax, change_s=1.0, alerts=ANSWER["alerts"], actions=ANSWER["actions"]),
+        lambda ax: data_quality(ax, log(), WINDOWS),
         lambda ax: plots.region(ax, plane, point=(0.3, 1.0)),
-        lambda ax: plots.setting_region(ax, SETTING, T_range=(0.1, 2.0), K_range=(0.3, 1.3), points=11),
+        lambda ax: setting_region(ax, SETTING, T_range=(0.1, 2.0), K_range=(0.3, 1.3), points=11),
         lambda ax: plots.gain_curve(ax, omega, curve, peak=(0.86, 2.24)),
         lambda ax: plots.verdict_legend(ax),
     ]
@@ -79,7 +81,7 @@ def test_every_drawing_returns_the_axes_it_was_given() -> None:
 
 
 def test_band_shows_interval_and_breaks_where_not_excited() -> None:
-    ax = plots.belief_band(axes(), WINDOWS, "T_L")
+    ax = belief_band(axes(), WINDOWS, "T_L")
     mean = next(line for line in ax.lines if line.get_label() == "mean")
     x, y = np.asarray(mean.get_xdata(), float), np.asarray(mean.get_ydata(), float)
     assert np.isnan(y[(x > 2.0) & (x < 4.0)]).all()
@@ -90,7 +92,7 @@ def test_band_shows_interval_and_breaks_where_not_excited() -> None:
 
 
 def test_band_breaks_across_a_gap() -> None:
-    ax = plots.belief_band(axes(), [window(0.0), window(10.0)], "T_L")
+    ax = belief_band(axes(), [window(0.0), window(10.0)], "T_L")
     mean = next(line for line in ax.lines if line.get_label() == "mean")
     y = np.asarray(mean.get_ydata(), float)
     assert np.isnan(y).sum() == 1
@@ -98,7 +100,7 @@ def test_band_breaks_across_a_gap() -> None:
 
 def test_a_broad_first_prior_does_not_squeeze_the_rest() -> None:
     first = {**window(0.0, excited=False), "T_L": {"mean": 5.0, "sd": 9.0, "q05": 0.1, "q95": 30.0}}
-    ax = plots.belief_band(axes(), [first, *WINDOWS], "T_L")
+    ax = belief_band(axes(), [first, *WINDOWS], "T_L")
     assert ax.get_ylim()[1] < 3.0
 
 
@@ -118,24 +120,23 @@ def verdict_at(ax: Axes, x: float, y: float) -> str:
 def test_map_distinguishes_the_three_verdicts() -> None:
     local = np.array([[False, True, True]] * 2)
     string = np.array([[False, False, True]] * 2)
-    ax = plots.verdict_map(axes(), [0.0, 1.0, 2.0], [0.0, 1.0], local, string)
+    ax = verdict_map(axes(), [0.0, 1.0, 2.0], [0.0, 1.0], local, string)
     assert [verdict_at(ax, x, y) for y in (0.0, 1.0) for x in (0.2, 1.2, 1.8)] == [UNSTABLE, AMPLIFIES, STABLE] * 2
     assert len({UNSTABLE, AMPLIFIES, STABLE}) == 3
 
 
 def test_map_of_one_verdict_only() -> None:
     everywhere = np.ones((2, 3), bool)
-    plots.verdict_map(axes(), [0.0, 1.0, 2.0], [0.0, 1.0], everywhere, everywhere, np.ones((2, 3)))
+    verdict_map(axes(), [0.0, 1.0, 2.0], [0.0, 1.0], everywhere, everywhere, np.ones((2, 3)))
     nowhere = np.zeros((2, 3), bool)
-    plots.verdict_map(axes(), [0.0, 1.0, 2.0], [0.0, 1.0], nowhere, nowhere, np.full((2, 3), np.inf))
+    verdict_map(axes(), [0.0, 1.0, 2.0], [0.0, 1.0], nowhere, nowhere, np.full((2, 3), np.inf))
 
 
 def test_the_legend_names_what_is_drawn() -> None:
-    stable = plots.verdict_map(axes(), [0.0, 1.0], [0.0, 1.0], np.ones((2, 2), bool), np.ones((2, 2), bool))
-    partly = plots.verdict_map(axes(), [0.0, 1.0], [0.0, 1.0], np.ones((2, 2), bool), np.eye(2, dtype=bool))
+    x = y = [0.0, 1.0]
     names = []
-    for beside in ((), (partly,)):
-        legend = plots.verdict_legend(stable, beside=beside).get_legend()
+    for string in (np.ones((2, 2), bool), np.eye(2, dtype=bool)):
+        legend = plots.verdict_legend(verdict_map(axes(), x, y, np.ones((2, 2), bool), string)).get_legend()
         assert legend is not None
         names.append([text.get_text() for text in legend.get_texts()])
     assert names == [["string stable"], ["string stable", "stable, amplifies (lines: peak gain)"]]
@@ -143,7 +144,7 @@ def test_the_legend_names_what_is_drawn() -> None:
 
 def test_labels_of_lines_are_not_cut_off() -> None:
     figure = Figure(figsize=(4, 4), dpi=100)
-    ax = plots.setting_region(figure.subplots(), SETTING, T_range=(0.02, 2.2), K_range=(0.25, 1.3), points=101)
+    ax = setting_region(figure.subplots(), SETTING, T_range=(0.02, 2.2), K_range=(0.25, 1.3), points=101)
     figure.canvas.draw()
     frame = ax.get_window_extent()
     labels = [text.get_window_extent() for text in ax.texts]
@@ -158,7 +159,7 @@ def test_labels_of_lines_are_not_cut_off() -> None:
 def test_a_probability_is_drawn_from_when_it_is_known() -> None:
     """The window from 4 to 6 s has P 0, which nobody knows at 5 s; the action at 6 s has 0.8, and 8 s is the end."""
     actions = [{"time_s": 6.0, "p_string_stable": 0.8}]
-    ax = plots.string_probability(axes(), WINDOWS, actions=actions)
+    ax = string_probability(axes(), WINDOWS, actions=actions)
     x, p = (np.asarray(values, float) for values in ax.lines[0].get_data())
     assert list(zip(x.tolist(), p.tolist(), strict=True)) == [
         (2.0, 1.0),
@@ -173,12 +174,12 @@ def test_setting_region_is_that_of_the_effective_vehicle() -> None:
     # with the lower level's model right at (1.5, 0.5) that vehicle behaves as the target and is string stable
     right = {**SETTING, "T_hat": 1.5, "K_hat": 0.5}
     for setting, expected in ((SETTING, AMPLIFIES), (right, STABLE)):
-        ax = plots.setting_region(axes(), setting, T_range=(1.4, 1.6), K_range=(0.45, 0.55), points=3)
+        ax = setting_region(axes(), setting, T_range=(1.4, 1.6), K_range=(0.45, 0.55), points=3)
         assert verdict_at(ax, 1.5, 0.5) == expected
 
 
 def test_quality_shows_what_was_masked() -> None:
-    ax = plots.data_quality(axes(), log(), WINDOWS)
+    ax = data_quality(axes(), log(), WINDOWS)
     labels = [t.get_text() for t in ax.get_yticklabels()]
     spans = dict(zip(labels, (len(c.get_paths()) for c in ax.collections), strict=True))
     assert spans == {"recorded": 2, "driver in charge": 1, "standstill": 1, "excited windows": 3}
@@ -259,7 +260,7 @@ def test_save_refuses_a_folder(tmp_path: Path) -> None:
 
 def test_an_excited_window_that_did_not_settle_is_drawn_as_carried_over() -> None:
     lost = {**window(2.0), "used": False}
-    ax = plots.belief_band(axes(), [{**window(0.0), "used": True}, lost], "T_L")
+    ax = belief_band(axes(), [{**window(0.0), "used": True}, lost], "T_L")
     mean = next(line for line in ax.lines if line.get_label() == "mean")
     x, y = np.asarray(mean.get_xdata(), float), np.asarray(mean.get_ydata(), float)
     assert np.isnan(y[x > 2.0]).all()
@@ -285,5 +286,5 @@ def test_a_second_detector_is_marked_while_the_first_goes_on() -> None:
 
 def test_a_collision_is_named_in_the_spacing() -> None:
     for spacing, told in ((np.linspace(5.0, -3.0, len(TIME)), 1), (np.full_like(TIME, 5.0), 0)):
-        ax = plots.motion(axes(), TIME, {"without action": spacing}, quantity="spacing")
+        ax = motion(axes(), TIME, {"without action": spacing}, quantity="spacing")
         assert [t.get_text() for t in ax.texts] == ["below 0: collision"] * told

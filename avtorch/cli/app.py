@@ -10,11 +10,13 @@ import inspect
 import os
 import shlex
 import sys
+import webbrowser
 from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
-from cyclopts import App, CycloptsError, MissingArgumentError
+from cyclopts import App, CoercionError, CycloptsError, MissingArgumentError, Parameter, ValidationError
 
 from avtorch.cli.arguments import COMMAND_LINE, free_folder
 from avtorch.cli.check import check
@@ -28,7 +30,6 @@ from avtorch.cli.simulators import check_simulator
 from avtorch.cli.stability import stability
 from avtorch.cli.validate import validate
 from avtorch.cli.watch import watch
-from avtorch.cli.workbench import workbench
 from avtorch.errors import InputError, printable
 from avtorch.version import __version__
 
@@ -74,11 +75,55 @@ def alone_in_out(command: Callable[..., None]) -> Callable[..., None]:
     return held
 
 
+def workbench(
+    folder: Path = Path(),
+    /,
+    *,
+    port: Annotated[int, Parameter(help="Port of this machine; default: a free one.")] = 0,
+    open_page: Annotated[bool, Parameter(name="--open", help="Show the page in your browser.")] = True,
+) -> None:
+    """Open the workbench: drop a log, confirm its columns, diagnose it, switch effects, save the report.
+
+    A page for your browser, on this machine alone; Ctrl-C ends it. Needs pip install 'avtorch[app]'.
+
+    Parameters
+    ----------
+    folder
+        The folder with your logs; nothing outside it is read. Answers go to its folder out.
+    """
+    from avtorch.app.serve import server_of
+    from avtorch.app.workplace import Workplace
+
+    if not 0 <= port < 65536:
+        raise InputError(f"--port: found {port}, needs a number from 1 to 65535")
+    server, address = server_of(Workplace.of(folder), port)
+    server.start()
+    print(f"The workbench is at {address}\nOnly this address opens it. Ctrl-C ends it.", flush=True)
+    if open_page:
+        server.io_loop.add_callback(webbrowser.open, address)
+    try:
+        server.io_loop.start()
+    finally:
+        server.stop()
+
+
 for _command in (check, check_simulator, watch):
     app.command(_command)
 for _command in (run, estimate, diagnose, compare, fleet, stability, validate, paper):
     app.command(alone_in_out(_command))
 app.command(workbench, name="app")
+
+
+def _said(fault: CycloptsError) -> str:
+    """Of a value that a check of ours refuses, the option and what it needs; the parser's own message otherwise."""
+    argument = fault.argument
+    if isinstance(fault, MissingArgumentError):
+        return _missing(fault)
+    if argument is None:
+        return str(fault)
+    if isinstance(fault, ValidationError):
+        return f"{argument.name}: {fault.exception_message}"
+    return f"{argument.name}: {fault.msg}" if isinstance(fault, CoercionError) and fault.msg else str(fault)
 
 
 def _missing(fault: MissingArgumentError) -> str:
@@ -115,7 +160,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
         app(tokens, exit_on_error=False, print_error=False)
     except (InputError, CycloptsError) as fault:
         # one line, however many the parser's own message has
-        message = _missing(fault) if isinstance(fault, MissingArgumentError) else str(fault)
+        message = _said(fault) if isinstance(fault, CycloptsError) else str(fault)
         most = None if isinstance(fault, InputError) else 400
         print("avtorch: " + printable(" ".join(message.split()), most), file=sys.stderr)
         return 2

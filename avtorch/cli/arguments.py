@@ -1,13 +1,13 @@
-"""Arguments that commands share, and the checks that turn a bad one into one line; the command as it was given."""
+"""Options that commands share, each with its check and its help; the command as it was given."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Group, Parameter, Token
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 OUTPUT = Group("Output", sort_key=9)
 COMMAND_LINE: ContextVar[str | None] = ContextVar("command_line", default=None)
 """The command, quoted for a shell, for answers that tell how they were made; None outside one."""
+_HOW_SHOWN = ("out", "open_page", "json", "quiet", "verbose", "resume")
+"""Options that change nothing in an answer."""
 
 
 def whole_number(_: Any, tokens: Sequence[Token]) -> int:
@@ -43,6 +45,32 @@ def local_folder(_: Any, tokens: Sequence[Token]) -> Path:
     return Path(text)
 
 
+def _checked(fits: Callable[[Any], bool], needs: str) -> Callable[[Any, Any], None]:
+    """The check of an option that is given: what `fits` it, and what it `needs` in words."""
+
+    def check(_: Any, value: float | None) -> None:
+        if value is not None and not fits(value):
+            found = f"{value:g}" if isinstance(value, float) else value
+            raise ValueError(f"found {found}, needs {needs}")
+
+    return check
+
+
+def above_zero(unit: str = "") -> Callable[[Any, Any], None]:
+    return _checked(lambda x: math.isfinite(x) and x > 0, f"a finite number above 0 {unit}".rstrip())
+
+
+def zero_or_more(unit: str = "") -> Callable[[Any, Any], None]:
+    return _checked(lambda x: math.isfinite(x) and x >= 0, f"a finite number of 0 {unit} or more".replace("  ", " "))
+
+
+def at_least(least: int) -> Callable[[Any, Any], None]:
+    return _checked(lambda x: x >= least, f"{least} or more")
+
+
+_is_seed = _checked(lambda x: 0 <= x < 2**63, "a whole number from 0 to 2^63 - 1")
+
+
 Out = Annotated[
     Path,
     Parameter(name="--out", group=OUTPUT, converter=local_folder, help="Folder for the answer and the pictures."),
@@ -63,26 +91,45 @@ Verbose = Annotated[
 ]
 Json = Annotated[bool, Parameter(name="--json", negative=(), group=OUTPUT, help="Print the answer as JSON, no tables.")]
 Quiet = Annotated[bool, Parameter(name=("--quiet", "-q"), negative=(), group=OUTPUT, help="Print nothing but errors.")]
-Seed = Annotated[int, Parameter(name="--seed", converter=whole_number, help="Seed of everything random.")]
+Seed = Annotated[
+    int, Parameter(name="--seed", converter=whole_number, validator=_is_seed, help="Seed of everything random.")
+]
 Gains = Annotated[str, Parameter(name="--gains", help="Gains k_s,k_v,k_a of the upper level.")]
-Lag = Annotated[float, Parameter(name="--T", help="Actuation lag T_L [s].")]
-Gain = Annotated[float, Parameter(name="--K", help="Actuation gain K_L [-].")]
-TimeGap = Annotated[float, Parameter(name="--tau", help="Time gap [s].")]
-
-
-def positive(name: str, value: float, unit: str = "") -> None:
-    if not (math.isfinite(value) and value > 0):
-        raise InputError(f"{name}: found {value:g}, needs a finite number above 0 {unit}".rstrip())
-
-
-def not_negative(name: str, value: float, unit: str = "") -> None:
-    if not (math.isfinite(value) and value >= 0):
-        raise InputError(f"{name}: found {value:g}, needs a finite number of 0 {unit} or more".replace("  ", " "))
-
-
-def seed_number(seed: int) -> None:
-    if not 0 <= seed < 2**63:
-        raise InputError(f"--seed: found {seed}, needs a whole number from 0 to 2^63 - 1")
+Lag = Annotated[float, Parameter(name="--T", validator=above_zero("s"), help="Actuation lag T_L [s].")]
+Gain = Annotated[float, Parameter(name="--K", validator=above_zero(), help="Actuation gain K_L [-].")]
+TimeGap = Annotated[float, Parameter(name="--tau", validator=above_zero("s"), help="Time gap [s].")]
+Window = Annotated[float, Parameter(validator=above_zero("s"), help="Length of a window [s].")]
+Accepted = Annotated[
+    str, Parameter(help="T_L,K_L of the car as it should be, which accepted_change compares with [s, -].")
+]
+DeadTime = Annotated[
+    float | None,
+    Parameter(
+        validator=zero_or_more("s"),
+        help="Dead time of the car [s], if known; by default inferred where jerk is not measured.",
+    ),
+]
+Form = Annotated[
+    Literal["auto", "jerk", "latent"],
+    Parameter(help="Likelihood: of measured jerk, or of noisy acceleration and speed."),
+]
+Estimator = Annotated[
+    Literal["auto", "sgld", "importance", "map", "rls", "ekf", "ukf"],
+    Parameter(
+        help="SGLD, importance sampling, posterior mode, recursive least squares, extended or unscented Kalman "
+        "filter; auto: SGLD where jerk is measured, else importance sampling."
+    ),
+]
+Mode = Annotated[
+    Literal["lambda", "posterior", "forgetting"], Parameter(help="How a posterior becomes the next prior.")
+]
+Baseline = Annotated[str, Parameter(help="Your simulator: glvd, effects such as dead_time=0.2, or a TOML file.")]
+Effects = Annotated[str | None, Parameter(help="Only these effects, NAME,NAME,...; default: all.")]
+Pairs = Annotated[bool, Parameter(help="Look for several effects at once.")]
+Budget = Annotated[
+    float | None,
+    Parameter(validator=above_zero("s"), help="Stop the search of a diagnosis after this time [s]; default: none."),
+]
 
 
 def _numbers(name: str, text: str, count: int, needs: str, fits: Callable[[list[float]], bool]) -> list[float]:
@@ -96,40 +143,26 @@ def _numbers(name: str, text: str, count: int, needs: str, fits: Callable[[list[
     return values
 
 
-def three_gains(name: str, text: str) -> tuple[float, float, float]:
-    k_s, k_v, k_a = _numbers(name, text, 3, "three numbers k_s,k_v,k_a such as 1.5,1.5,-0.8", lambda _: True)
+def three_gains(text: str) -> tuple[float, float, float]:
+    k_s, k_v, k_a = _numbers("--gains", text, 3, "three numbers k_s,k_v,k_a such as 1.5,1.5,-0.8", lambda _: True)
     return k_s, k_v, k_a
 
 
-def positive_pair(name: str, text: str, of: str, example: str) -> tuple[float, float]:
-    one, two = _numbers(name, text, 2, f"two numbers {of} above 0 such as {example}", lambda x: min(x) > 0)
-    return one, two
+def accepted_pair(text: str) -> tuple[float, float]:
+    needs = "two numbers T_L,K_L above 0 such as 0.3,1.0"
+    lag, gain = _numbers("--accepted", text, 2, needs, lambda x: min(x) > 0)
+    return lag, gain
 
 
-def limits_pair(name: str, text: str) -> tuple[float, float]:
+def limits_pair(text: str) -> tuple[float, float]:
     """Two numbers, the first below zero and the second above."""
     needs = "MIN,MAX [m/s²] below and above 0, such as -6,4"
-    low, high = _numbers(name, text, 2, needs, lambda x: x[0] < 0 < x[1])
+    low, high = _numbers("--limits", text, 2, needs, lambda x: x[0] < 0 < x[1])
     return low, high
 
 
-def two_axes(text: str) -> tuple[str, str]:
-    known = ("k_s", "k_v", "k_a", "tau", "T", "K")
-    names = tuple(part.strip() for part in text.split(","))
-    if len(names) != 2 or names[0] == names[1] or not set(names) <= set(known):
-        raise InputError(
-            f"--plane: found {quoted(text)}, needs two different names out of {', '.join(known)} such as tau,T"
-        )
-    return names[0], names[1]
-
-
-def free_folder(out: Path, *, without: str | None = None) -> None:
-    """Refuse a place that cannot become a folder before any work is done; nothing is made yet.
-
-    `without`: an answer that must not be in the folder already, because its pictures have the same names as this one's.
-    """
-    if without is not None and (out / without).exists():
-        raise InputError(f"--out: {out} holds {without}, and pictures of the same names; needs another folder")
+def free_folder(out: Path) -> None:
+    """Refuse a place that cannot become a folder before any work is done; nothing is made yet."""
     for place in (out, *out.parents):
         if place.exists():
             if not place.is_dir():
@@ -138,10 +171,22 @@ def free_folder(out: Path, *, without: str | None = None) -> None:
             return
 
 
-def origin_of(paths: Sequence[Path], **settings: Any) -> Origin:
-    """How an answer is made, by the files as they are now; a log's mapping file is one of them."""
+def folder_without(out: Path, other: str) -> None:
+    """Refuse a folder with an answer whose pictures have the same names as this one's."""
+    if (out / other).exists():
+        raise InputError(f"--out: {out} holds {other}, and pictures of the same names; needs another folder")
+
+
+def origin_of(paths: Sequence[Path], given: Mapping[str, Any]) -> Origin:
+    """How an answer is made: by the files as they are now, with a log's mapping file, and by the arguments `given` to
+    the command, without paths and what only says how the answer is shown."""
     from avtorch.io.mapping import mapping_beside
     from avtorch.report import Origin
 
     beside = [place for place in (mapping_beside(path) for path in paths) if place is not None]
+    settings = {name: value for name, value in given.items() if name not in _HOW_SHOWN and not _is_path(value)}
     return Origin.of(COMMAND_LINE.get(), [*paths, *beside], settings)
+
+
+def _is_path(value: Any) -> bool:
+    return isinstance(value, Path) or (isinstance(value, list) and any(isinstance(x, Path) for x in value))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from avtorch.cli.arguments import OUTPUT, Columns, Json, Quiet, Units
+from avtorch.cli import arguments as arg
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 def check(
     log: Path,
     *,
-    map: Columns = None,
-    unit: Units = None,
+    map: arg.Columns = None,
+    unit: arg.Units = None,
     yes: Annotated[
-        bool, Parameter(name=("--yes", "-y"), negative=(), group=OUTPUT, help="Write the proposed mapping unasked.")
+        bool, Parameter(name=("--yes", "-y"), negative=(), group=arg.OUTPUT, help="Write the proposed mapping unasked.")
     ] = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    json: arg.Json = False,
+    quiet: arg.Quiet = False,
 ) -> None:
     """Check a log: what it holds, how to read it, what it can tell and what not.
 

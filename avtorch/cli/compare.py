@@ -8,26 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from avtorch.cli.arguments import (
-    OUTPUT,
-    Columns,
-    Json,
-    Open,
-    Quiet,
-    Units,
-    free_folder,
-    local_folder,
-    origin_of,
-)
+from avtorch.cli import arguments as arg
 from avtorch.cli.simulators import read_simulator, simulator_of, simulators_of
-from avtorch.cli.talk import Talk
+from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
     from avtorch.external import SimulatorComparison
     from avtorch.gap.result.comparison import Comparison
     from avtorch.io import Log
-    from avtorch.report import Origin
 
 PAGE = "comparison.html"
 
@@ -64,13 +53,15 @@ def compare(
     ] = None,
     out: Annotated[
         Path | None,
-        Parameter(name="--out", group=OUTPUT, converter=local_folder, help="Folder for comparison.html and .json."),
+        Parameter(
+            name="--out", group=arg.OUTPUT, converter=arg.local_folder, help="Folder for comparison.html and .json."
+        ),
     ] = None,
-    map: Columns = None,
-    unit: Units = None,
-    open_page: Open = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    map: arg.Columns = None,
+    unit: arg.Units = None,
+    open_page: arg.Open = False,
+    json: arg.Json = False,
+    quiet: arg.Quiet = False,
 ) -> None:
     """Did a change to the car, or to the simulator, help? By how much, with intervals.
 
@@ -82,66 +73,68 @@ def compare(
         Logs, as for diagnose: the drive before the change and the one after it; with --after any number before it; with
         two simulators a single one.
     """
-    if out is not None:
-        free_folder(out)
-    elif open_page:
+    given = dict(locals())
+    if open_page and out is None:
         raise InputError("--open: found without --out; needs a folder for the page")
     two = [*(simulator or ()), *(simulated or ())]
     before, later = (logs, after) if after else (logs[:1], logs[1:])
     if len(later) > 1 and not after:
         raise InputError(f"LOGS: found {len(logs)}, needs two; with more, say --after before those after the change")
-    if not later:
+    if two and (baseline != "glvd" or baseline_after is not None):
+        raise InputError("--baseline: found beside --simulator or --simulated, needs the plant as --simulator")
+    talk = Talk(json=json, quiet=quiet)
+    found: Comparison | SimulatorComparison
+    if later:
+        if len(simulator or ()) > 1:
+            raise InputError(f"--simulator: found {len(two)} beside several logs, needs one, or one log")
+        base = read_simulator("--baseline", baseline)
+        other = None if baseline_after is None else read_simulator("--baseline-after", baseline_after)
+        if baseline_after is not None and (base is None or other is None):
+            needs = "needs --baseline and --baseline-after given"
+            raise InputError(f"--baseline-after: found without two simulators; {needs}")
+
+        from avtorch.gap.compare import compare as work
+
+        sides = [[_log(path, map, unit, talk) for path in paths] for paths in (before, later)]
+        read = [*sides[0], *sides[1]]
+        drives = list(zip([*before, *later], read, strict=True))
+        own = simulator_of(simulated or (), (simulator or (None,))[0], step, drives)
+        with talk.progress("Comparing") as step_done:
+            found = work(*sides, baseline=own or base, baseline_after=other, progress=step_done)
+    else:
         if not two:
-            raise InputError(
-                "AFTER: missing; needs a file, or two of --simulator and --simulated, see avtorch compare --help"
-            )
+            needs = "needs a file, or two of --simulator and --simulated, see avtorch compare --help"
+            raise InputError(f"AFTER: missing; {needs}")
         if len(two) != 2:
             raise InputError(f"--simulator, --simulated: found {len(two)} beside one log, needs two")
-        if baseline != "glvd" or baseline_after is not None:
-            raise InputError("--baseline: found beside --simulator or --simulated, needs a plant as --simulator")
-        talk = Talk(json=json, quiet=quiet)
-        log = _log(logs[0], map, unit, talk)
-        first, second = simulators_of(simulator or (), simulated or (), step, logs[0], log)
 
         from avtorch.external import compare_simulators
 
+        read = [_log(logs[0], map, unit, talk)]
+        first, second = simulators_of(simulator or (), simulated or (), step, logs[0], read[0])
         with talk.progress("Comparing") as step_done:
-            found = compare_simulators(log, first, second, progress=step_done)
-        files = [*logs, *_files([*two])]
-        origin = origin_of(files, map=map, unit=unit, simulator=simulator, simulated=simulated, step=step)
-        _answer(talk, found, out, [log], origin, open_page)
-        if not talk.json:
-            for which in (x for x in (found.first, found.second) if x.notes):
-                talk.notes(which.name, which.notes)
-        return
-    if len(simulator or ()) > 1:
-        raise InputError(f"--simulator: found {len(two)} beside several logs, needs one, or one log")
-    if two and (baseline != "glvd" or baseline_after is not None):
-        raise InputError("--baseline: found beside --simulator or --simulated, needs one simulator")
-    base = read_simulator("--baseline", baseline)
-    other = None if baseline_after is None else read_simulator("--baseline-after", baseline_after)
-    if baseline_after is not None and (base is None or other is None):
-        raise InputError("--baseline-after: found without two simulators; needs --baseline and --baseline-after given")
+            found = compare_simulators(read[0], first, second, progress=step_done)
+        for which in (x for x in (found.first, found.second) if x.notes):
+            talk.notes(which.name, which.notes)
 
-    from avtorch.gap.compare import compare as work
+    from avtorch.io import check
+    from avtorch.report import comparison_html
+    from avtorch.report.comparison import comparison_tables
 
-    talk = Talk(json=json, quiet=quiet)
-    sides = [[_log(path, map, unit, talk) for path in paths] for paths in (before, later)]
-    read = [*sides[0], *sides[1]]
-    drives = list(zip([*before, *later], read, strict=True))
-    own = simulator_of(simulated or (), (simulator or (None,))[0], step, drives, adjust=(), rollouts=None, processes=1)
-    with talk.progress("Comparing") as step_done:
-        comparison = work(*sides, baseline=own or base, baseline_after=other, progress=step_done)
-    origin = origin_of(
-        [*before, *later, *_files([*two, baseline, baseline_after or ""])],
-        map=map,
-        unit=unit,
-        simulator=simulator,
-        simulated=simulated,
-        step=step,
-        baseline=[baseline, baseline_after],
-    )
-    _answer(talk, comparison, out, read, origin, open_page)
+    if out is not None:
+        notes = [f"{log.name}: {note}" for log in read for note in check(log).notes]
+        origin = arg.origin_of([*before, *later, *_files([*two, baseline, baseline_after or ""])], given)
+        pages = {PAGE: lambda: comparison_html(found, notes=notes, origin=origin)}
+        write_answer(out, "comparison.json", found.to_dict(), pages=pages)
+        if open_page:
+            talk.show(out / PAGE)
+    talk.lines([found.why, ""], "bold")
+    for table in () if talk.silent else comparison_tables(found):
+        talk.table(table)
+    if out is not None:
+        talk.done(out, found.to_dict(), [PAGE, "comparison.json"])
+    elif talk.json:
+        talk.answer(found.to_dict())
 
 
 def _files(sources: Sequence[str]) -> list[Path]:
@@ -158,33 +151,3 @@ def _log(path: Path, map: list[str] | None, unit: list[str] | None, talk: Talk) 
     require_usable(log)
     talk.notes(log.name, check(log).notes)
     return log
-
-
-def _answer(
-    talk: Talk,
-    found: Comparison | SimulatorComparison,
-    out: Path | None,
-    logs: Sequence[Log],
-    origin: Origin,
-    open_page: bool,
-) -> None:
-    from avtorch.io import answer_set, check, write_json
-    from avtorch.report.comparison import comparison_tables
-
-    if out is not None:
-        from avtorch.report import comparison_html
-        from avtorch.report.page import written
-
-        notes = [f"{log.name}: {note}" for log in logs for note in check(log).notes]
-        with answer_set(out, ("comparison.json", PAGE)) as staged:
-            written(comparison_html(found, notes=notes, origin=origin), staged, PAGE)
-            write_json(staged / "comparison.json", found.to_dict())
-        if open_page:
-            talk.show(out / PAGE)
-    talk.lines([found.why, ""], "bold")
-    for table in () if talk.silent else comparison_tables(found):
-        talk.table(table)
-    if out is not None:
-        talk.done(out, found.to_dict(), [PAGE, "comparison.json"])
-    elif talk.json:
-        talk.answer(found.to_dict())

@@ -1,35 +1,19 @@
-"""`avtorch diagnose`: which effect the simulator lacks, by one or more logs of a car."""
+"""`avtorch diagnose`: which effect the simulator lacks, by one or more logs of a car, or of a car that follows."""
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from difflib import get_close_matches
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
 
-from avtorch.cli.arguments import (
-    OUTPUT,
-    Columns,
-    Json,
-    Open,
-    Quiet,
-    Seed,
-    Stamps,
-    Units,
-    Verbose,
-    free_folder,
-    local_folder,
-    origin_of,
-    positive,
-    seed_number,
-)
-from avtorch.cli.follower import follow, print_diagnosis, refuse
+from avtorch.cli import arguments as arg
 from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.simulators import read_simulator, refuse_loop, simulator_of
@@ -39,32 +23,32 @@ from avtorch.numeral import numeral
 
 if TYPE_CHECKING:
     from avtorch.experiment import Limits
+    from avtorch.gap.result.diagnosis import Diagnosis
     from avtorch.gap.result.traces import Alarm
     from avtorch.io import Log
+    from avtorch.report.table import Table
 
 TRACK = Group("Next experiment", sort_key=20)
 TESTED = Group("A simulator of your own", sort_key=19)
 FOLLOWER = Group("Car following", sort_key=21)
 CAUSES = ("none", "unknown", "pair")
 """Hypotheses besides the effects that a prior may weigh; `pair`: all pairs together."""
+PAGE = "report.html"
+OF_FOLLOWER = ("vehicle", "law", "event")
+"""Options that only --follower has a use for."""
+WITH_FOLLOWER = ("logs", "out", "map", "unit", "stamp", "effects", "seed", "open_page", "verbose", "json", "quiet")
+"""Those besides them that have a meaning with it."""
 
 
 def diagnose(
     logs: list[Path],
     /,
     *,
-    out: Annotated[
-        Path,
-        Parameter(
-            name="--out", group=OUTPUT, converter=local_folder, help="Folder for the answer and the repaired simulator."
-        ),
-    ],
-    map: Columns = None,
-    unit: Units = None,
-    stamp: Stamps = None,
-    baseline: Annotated[
-        str, Parameter(help="Your simulator: glvd, effects such as dead_time=0.2, or a TOML file.")
-    ] = "glvd",
+    out: arg.Out,
+    map: arg.Columns = None,
+    unit: arg.Units = None,
+    stamp: arg.Stamps = None,
+    baseline: arg.Baseline = "glvd",
     simulated: Annotated[
         list[str] | None,
         Parameter(
@@ -110,10 +94,10 @@ def diagnose(
         Literal["kinematic", "specific-force"],
         Parameter(help="What accel is: dv/dt, or an accelerometer's reading of specific force."),
     ] = "kinematic",
-    budget: Annotated[float | None, Parameter(help="Stop the search after this time [s]; default: none.")] = None,
+    budget: arg.Budget = None,
     material: Annotated[float, Parameter(help="Share of the gap from which something counts, between 0 and 1.")] = 0.03,
-    effects: Annotated[str | None, Parameter(help="Only these effects, NAME,NAME,...; default: all.")] = None,
-    pairs: Annotated[bool, Parameter(help="Look for several effects at once.")] = True,
+    effects: arg.Effects = None,
+    pairs: arg.Pairs = True,
     named_only: Annotated[
         bool, Parameter(negative=(), help="The repaired simulator has named effects alone, no map without a name.")
     ] = False,
@@ -130,7 +114,9 @@ def diagnose(
     ] = None,
     credibility: Annotated[
         bool,
-        Parameter(negative=(), group=OUTPUT, help="Also write credibility.html and .md, the evidence for an assessor."),
+        Parameter(
+            negative=(), group=arg.OUTPUT, help="Also write credibility.html and .md, the evidence for an assessor."
+        ),
     ] = False,
     follower: Annotated[
         bool, Parameter(group=FOLLOWER, negative=(), help="The log is of a car that follows, and has no accel_cmd.")
@@ -155,11 +141,11 @@ def diagnose(
     ] = None,
     road: Annotated[float | None, Parameter(group=TRACK, help="Length of the road [m]; default: 2000.")] = None,
     seconds: Annotated[float | None, Parameter(group=TRACK, help="Duration [s]; default: 60.")] = None,
-    seed: Seed = 0,
-    open_page: Open = False,
-    verbose: Verbose = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    seed: arg.Seed = 0,
+    open_page: arg.Open = False,
+    verbose: arg.Verbose = False,
+    json: arg.Json = False,
+    quiet: arg.Quiet = False,
 ) -> None:
     """What does the simulator lack? Names the effect, its parameters, and what the log cannot distinguish.
 
@@ -173,70 +159,42 @@ def diagnose(
         throttle, brake, torque or current, which needs speed.
         With --follower: time, speed, spacing, lead_speed, or an OpenACC, NGSIM or I-24 file.
     """
-    if budget is not None:
-        positive("--budget", budget, "s")
+    given = dict(locals())
     if not 0 < material < 1:
         raise InputError(f"--material: found {material:g}, needs a share between 0 and 1, such as 0.05")
-    seed_number(seed)
-    free_folder(out)
-    track = {
-        "speed_min": speed_min,
-        "speed_max": speed_max,
-        "accel_min": accel_min,
-        "accel_max": accel_max,
-        "road": road,
-        "seconds": seconds,
-    }
     chosen = chosen_effects(effects)
     weights = _prior(prior or ())
     assumed = read_simulator("--baseline", baseline)
     if assumed is not None and (simulated or simulator is not None):
         raise InputError("--baseline: found beside --simulated or --simulator, needs one simulator")
+    options = inspect.signature(diagnose).parameters
+    changed = {name for name, value in given.items() if value != options[name].default}
 
-    from avtorch.cli.diagnose import read_alarms
     from avtorch.io import Log, check
 
     talk = Talk(json=json, quiet=quiet)
     if follower:
-        usual = {
-            "accel_kind": accel_kind == "kinematic",
-            "no_pairs": pairs,
-            "named_only": not named_only,
-            "posterior": posterior == "sgld",
-        }
-        idle = {"simulated": simulated, "simulator": simulator, "step": step is not None, "adjust": adjust}
-        idle |= {"estimates": estimates, "rollouts": rollouts is not None, "processes": processes != 1}
-        idle |= {"credibility": credibility, "baseline": assumed, "prior": weights, "budget": budget is not None}
-        idle |= {option: not default for option, default in usual.items()}
-        refuse(logs, **idle, **{option: value is not None for option, value in track.items()})
-        source = {"map": map, "unit": unit, "stamp": stamp, "vehicle": vehicle, "event": event}
-        origin = origin_of(logs, **source, law=law, effects=chosen, seed=seed)
-        with talk.progress("Diagnosing") as done:
-            follow(
-                talk,
-                logs[0],
-                out,
-                source=source,
-                law=law,
-                effects=chosen,
-                seed=seed,
-                step=done,
-                origin=origin,
-                verbose=verbose,
-            )
+        if len(logs) > 1:
+            raise InputError(f"--follower: found {len(logs)} logs, needs one at a time")
+        for name in options:
+            if name in changed - {"follower", *OF_FOLLOWER, *WITH_FOLLOWER}:
+                negated = "no-" if given[name] is False else ""
+                raise InputError(f"--{negated}{name.replace('_', '-')}: has no meaning with --follower")
+        _follow(talk, given, chosen)
         if open_page:
-            talk.show(out / "report.html")
+            talk.show(out / PAGE)
         return
-    for option, given in (("--vehicle", vehicle), ("--law", law), ("--event", event)):
-        if given is not None:
-            raise InputError(f"{option}: has a meaning with --follower only")
+    for name in OF_FOLLOWER:
+        if name in changed:
+            raise InputError(f"--{name}: has a meaning with --follower only")
     read = [Log.read(path, map=map, unit=unit, stamp=stamp) for path in logs]
     refuse_loop(simulated, read)
     drives, fit, about_map = commanded(talk, read)
     for path, drive in zip(logs, drives, strict=True):
         _usable(path, drive, accel_kind)
         _check_effects(chosen or (), path, drive)
-    limits = _limits(drives, track)
+    track = ("speed_min", "speed_max", "accel_min", "accel_max", "road", "seconds")
+    limits = _limits(drives, {name: given[name] for name in track})
     alarms = read_alarms(estimates, drives) if estimates else ()
     with_paths = list(zip(logs, drives, strict=True))
     own = simulator_of(
@@ -249,30 +207,12 @@ def diagnose(
             talk.notes(drive.name, noted)
         quality += [f"{Path(drive.name).name}: {note}" for note in noted]
 
-    origin = origin_of(
-        [*logs, *([Path(baseline)] if baseline.endswith(".toml") else []), *(estimates or ())],
-        map=map,
-        unit=unit,
-        stamp=stamp,
-        baseline=baseline,
-        simulated=simulated,
-        simulator=simulator,
-        step=step,
-        adjust=adjust,
-        rollouts=rollouts,
-        prior=weights,
-        accel_kind=accel_kind,
-        budget=budget,
-        material=material,
-        effects=chosen,
-        pairs=pairs,
-        named_only=named_only,
-        posterior=posterior,
-        seed=seed,
+    origin = arg.origin_of(
+        [*logs, *([Path(baseline)] if baseline.endswith(".toml") else []), *(estimates or ())], given
     )
     from avtorch.gap.diagnose import diagnose as work
 
-    with talk.progress("Diagnosing", budget) as done:
+    with talk.progress("Diagnosing") as done:
         found = work(
             drives,
             baseline=own or assumed,
@@ -315,10 +255,88 @@ def diagnose(
         written += write_credibility(found, staged, quality=quality, origin=origin) if credibility else []
         written += write_pedals(fit, staged)
     if open_page:
-        talk.show(out / "report.html")
+        talk.show(out / PAGE)
     if not talk.json:
         print_diagnosis(talk, found, verbose=verbose)
     talk.done(out, found.to_dict(), files=[p.name for p in written])
+
+
+def _follow(talk: Talk, given: Mapping[str, Any], effects: Sequence[str] | None) -> None:
+    """Diagnose the follower as the arguments `given` say, write the answer and the page, and print a summary."""
+    from avtorch.follower import diagnose_follower
+    from avtorch.gap.result.diagnosis import DIAGNOSIS_FILES
+    from avtorch.io import answer_set, check, read_following, write_json
+    from avtorch.remedy import write_exports
+    from avtorch.report import write_report
+
+    path, out, verbose = given["logs"][0], given["out"], given["verbose"]
+    log = read_following(path, **{name: given[name] for name in ("map", "unit", "stamp", "vehicle", "event")})
+    noted = [*check(log).notes, *log.remarks]
+    if verbose:
+        talk.notes(log.name, noted)
+    origin = arg.origin_of([path], given)
+    with talk.progress("Diagnosing") as step:
+        found = diagnose_follower(log, law=given["law"], effects=effects, seed=given["seed"], progress=step)
+    gap = found.diagnosis
+    assert gap is not None
+    gap = replace(gap, notes=(*gap.notes, *found.conditional))
+    lines = found.sentences()
+    answer = replace(found, diagnosis=gap).to_dict()
+    with answer_set(out, (*DIAGNOSIS_FILES, *PEDAL_FILES)) as staged:
+        written = [*gap.write(staged), *write_exports(gap.plant, staged)]
+        write_json(staged / "diagnosis.json", answer)
+        written.append(write_report(gap, staged, quality=noted, sections={"The loop": lines}, origin=origin))
+    if not talk.json:
+        talk.lines(lines)
+        talk.line("")
+        talk.table(_loop_table(found.parameters))
+        talk.line("Conditional on that law, on the held-out half of the drive:")
+        print_diagnosis(talk, gap, verbose=verbose)
+    talk.done(out, answer, files=[p.name for p in written])
+
+
+def _loop_table(parameters: Mapping[str, Any]) -> Table:
+    from avtorch.gap.quantity import unit_of, words_of
+    from avtorch.report.table import Table
+
+    units = {name: "" if unit_of(name) == "-" else f" {unit_of(name)}" for name in parameters}
+    rows = tuple(
+        (words_of(name), f"{q.mean:.2f}{units[name]}", f"{q.q05:.2f} to {q.q95:.2f}") for name, q in parameters.items()
+    )
+    return Table("The loop", ("of the loop", "mean", "90 %"), rows)
+
+
+def print_diagnosis(talk: Talk, found: Diagnosis, *, verbose: bool = False) -> None:
+    """The verdict in one sentence and one table; the page's other sentences and tables where `verbose`."""
+    from avtorch.gap.result import sentences
+    from avtorch.report.diagnosis_tables import budget_table, candidate_table
+
+    odd = found.winner.implausible
+    known = {"unknown": "bold yellow", "none": "bold green"}
+    talk.lines([sentences.headline(found)], "bold yellow" if odd else known.get(found.verdict.name, "bold cyan"))
+    talk.lines(odd, "yellow")
+    if not found.complete:
+        text = "The budget ended the search: the answer is provisional; give the command a larger one."
+        talk.lines([text], "yellow")
+    if verbose:
+        talk.lines([*sentences.tested(found), *sentences.budget(found)])
+    elif found.budget is not None and found.budget.rest:
+        talk.lines([found.budget.rest])
+    if verbose:
+        talk.lines([found.verdict.why], "dim")
+    talk.line("")
+    budget = found.budget
+    divided = budget is not None and (budget.parts or budget.chance or budget.unexplained.material)
+    if budget is not None and divided:
+        talk.table(budget_table(budget, found.log.epochs_s[0]))
+    if verbose or not divided:
+        talk.table(candidate_table(found, most=8 if verbose else 5))
+    if verbose:
+        talk.lines([sentences.aliases(found), *sentences.onset(found), *sentences.where(found)])
+        talk.lines([*sentences.moved(found), *sentences.gap(found), *sentences.shrinkage(found)])
+        talk.lines([*sentences.to_set(found), *sentences.to_drive(found), *sentences.remains(found)])
+        talk.lines([note for note in found.notes if found.complete or "budget" not in note], "dim")
+        talk.line("")
 
 
 def _limits(drives: Sequence[Log], given: Mapping[str, float | None]) -> Limits:
@@ -335,28 +353,23 @@ def _limits(drives: Sequence[Log], given: Mapping[str, float | None]) -> Limits:
     return limits
 
 
-def _known(option: str, name: str, more: Sequence[str] = ()) -> str:
-    from avtorch.gap import EFFECTS
-
-    if name not in EFFECTS and name not in more:
-        near = get_close_matches(name[:60], [*EFFECTS, *more], n=1) or [x for x in EFFECTS if name and name in x]
-        hint = f"; perhaps {near[0]}" if near else f", such as {', '.join(sorted(EFFECTS)[:3])}"
-        needs = "".join(f"{x}, " for x in more) + ("or " if more else "")
-        raise InputError(f"{option}: found {quoted(name)}, needs {needs}an effect's name{hint}")
-    return name
-
-
 def chosen_effects(text: str | None) -> list[str] | None:
     """The effects of `--effects`, None for all. Raises `InputError` for a name that is not known or comes twice."""
     if text is None:
         return None
-    names = [_known("--effects", part.strip()) for part in text.split(",")]
-    if len(set(names)) < len(names):
-        raise InputError(f"--effects: found {quoted(text)}, needs each name once")
+    from avtorch.gap.simulator.effect import chosen_effects as known
+
+    names = [part.strip() for part in text.split(",")]
+    try:
+        known(names)
+    except InputError as fault:
+        raise InputError(f"--effects: {str(fault).partition(': ')[2]}") from None
     return names
 
 
 def _prior(given: Sequence[str]) -> dict[str, float]:
+    from avtorch.gap import effect_class
+
     weights: dict[str, float] = {}
     for item in given:
         name, equals, value = (x.strip() for x in item.partition("="))
@@ -368,7 +381,12 @@ def _prior(given: Sequence[str]) -> dict[str, float]:
             raise InputError(
                 f"--prior: found {quoted(item)}, needs NAME=WEIGHT with a number of 0 or more, such as none=5"
             )
-        if _known("--prior", name, CAUSES) in weights:
+        if name not in CAUSES:
+            try:
+                effect_class(name)
+            except InputError as fault:
+                raise InputError(f"--prior: {str(fault).partition(': ')[2]}, or {', '.join(CAUSES)}") from None
+        if name in weights:
             raise InputError(f"--prior: found {name} twice, needs each name once")
         weights[name] = weight
     return weights
@@ -407,32 +425,24 @@ def read_alarms(paths: Sequence[Path], logs: Sequence[Log]) -> tuple[Alarm, ...]
     return tuple(
         alarm
         for number, (path, log) in enumerate(zip(paths, logs, strict=True))
-        for alarm in _alarms(_answer(path), path, log, number)
+        for alarm in _alarms(path, log, number)
     )
 
 
-def _answer(path: Path) -> Mapping[str, Any]:
+def _alarms(path: Path, log: Log, number: int) -> list[Alarm]:
+    from avtorch.gap.result.traces import Alarm
     from avtorch.io.opening import place, read_regular
 
     try:
-        found = json.loads(read_regular(path, most=_MOST_BYTES, need=_NEED).decode("utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as fault:
-        raise InputError(f"{place(path)}: is no JSON, needs {_NEED}") from fault
-    schema = found.get("schema") if isinstance(found, dict) else None
-    if schema != "avtorch.estimates/1":
-        raise InputError(f"{place(path)}: found {quoted(str(schema))} as its schema, needs {_NEED}")
-    return found
-
-
-def _alarms(answer: Mapping[str, Any], path: Path, log: Log, number: int) -> list[Alarm]:
-    from avtorch.gap.result.traces import Alarm
-    from avtorch.io.opening import place
-
-    try:
+        answer = json.loads(read_regular(path, most=_MOST_BYTES, need=_NEED).decode("utf-8"))
+        if answer["schema"] != "avtorch.estimates/1":
+            raise InputError(f"{place(path)}: found {quoted(str(answer['schema']))} as its schema, needs {_NEED}")
         rows, epoch = int(answer["quality"]["rows"]), float(answer["epoch_s"])
         windows = [(float(w["end_s"]), frozenset(map(str, w["alerts"]))) for w in answer["windows"]]
-    except (KeyError, TypeError, ValueError) as fault:
-        raise InputError(f"{place(path)}: is damaged, needs {_NEED}") from fault
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, RecursionError) as fault:
+        raise InputError(f"{place(path)}: is damaged or another file, needs {_NEED}") from fault
     if rows != log.rows or abs(epoch - log.epoch_s) > 1e-3:
         raise InputError(
             f"{place(path)}: is of a log of {rows} rows that begins at {epoch:.10g} s, needs the estimates of "

@@ -5,29 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 from cyclopts import Parameter
 
-from avtorch.cli.arguments import (
-    Columns,
-    Gains,
-    Json,
-    Open,
-    Out,
-    Quiet,
-    Seed,
-    Stamps,
-    TimeGap,
-    Units,
-    free_folder,
-    not_negative,
-    origin_of,
-    positive,
-    positive_pair,
-    seed_number,
-    three_gains,
-)
+from avtorch.cli import arguments as arg
 from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.talk import Talk, write_answer
@@ -49,43 +31,26 @@ PASSING_ON = ("auto", "sgld", "importance", "map")
 def estimate(
     log: Path,
     *,
-    window: Annotated[float, Parameter(help="Length of a window [s].")] = 2.0,
-    out: Out,
-    map: Columns = None,
-    unit: Units = None,
-    stamp: Stamps = None,
-    form: Annotated[
-        Literal["auto", "jerk", "latent"],
-        Parameter(help="Likelihood: of measured jerk, or of noisy acceleration and speed."),
-    ] = "auto",
-    estimator: Annotated[
-        Literal["auto", "sgld", "importance", "map", "rls", "ekf", "ukf"],
-        Parameter(
-            help="SGLD, importance sampling, posterior mode, recursive least squares, extended or unscented Kalman "
-            "filter; auto: SGLD where jerk is measured, else importance sampling."
-        ),
-    ] = "auto",
-    mode: Annotated[
-        Literal["lambda", "posterior", "forgetting"],
-        Parameter(help="How a posterior becomes the next prior (sgld and map)."),
-    ] = "lambda",
-    tau: TimeGap = 1.0,
-    gains: Gains = "1.5,1.5,-0.8",
-    accepted: Annotated[
-        str, Parameter(help="    T_L,K_L of the car as it should be, which accepted_change compares with [s, -].")
-    ] = "0.3,1.0",
-    dead_time: Annotated[
-        float | None,
-        Parameter(help="Dead time of the car [s], if known; by default inferred where jerk is not measured."),
-    ] = None,
+    window: arg.Window = 2.0,
+    out: arg.Out,
+    map: arg.Columns = None,
+    unit: arg.Units = None,
+    stamp: arg.Stamps = None,
+    form: arg.Form = "auto",
+    estimator: arg.Estimator = "auto",
+    mode: arg.Mode = "lambda",
+    tau: arg.TimeGap = 1.0,
+    gains: arg.Gains = "1.5,1.5,-0.8",
+    accepted: arg.Accepted = "0.3,1.0",
+    dead_time: arg.DeadTime = None,
     align: Annotated[
         bool, Parameter(help="Where accel and speed differ by a clock or a filter, put the late one on time.")
     ] = True,
     resume: Annotated[bool, Parameter(help="Resume an interrupted run in --out, or start again.")] = True,
-    seed: Seed = 0,
-    open_page: Open = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    seed: arg.Seed = 0,
+    open_page: arg.Open = False,
+    json: arg.Json = False,
+    quiet: arg.Quiet = False,
 ) -> None:
     """Estimate the vehicle's actuation, lag and gain, from a recorded drive, window by window.
 
@@ -100,14 +65,10 @@ def estimate(
         units and writes LOG.toml beside it. Without accel_cmd a map is made of throttle, brake, torque or current,
         which needs speed.
     """
-    positive("--window", window, "s")
-    positive("--tau", tau, "s")
-    k = three_gains("--gains", gains)
-    sound = positive_pair("--accepted", accepted, "T_L,K_L", "0.3,1.0")
-    if dead_time is not None:
-        not_negative("--dead-time", dead_time, "s")
-    free_folder(out, without="run.json")
-    seed_number(seed)
+    given = dict(locals())
+    k = arg.three_gains(gains)
+    sound = arg.accepted_pair(accepted)
+    arg.folder_without(out, "run.json")
     if mode != "lambda" and estimator not in PASSING_ON:
         raise InputError(f"--mode: has no meaning with --estimator {estimator}, which passes no prior on; leave it out")
 
@@ -143,32 +104,31 @@ def estimate(
 
     from avtorch import plots
     from avtorch.report import estimates_html
-    from avtorch.report.estimates import dead_time_note, estimates_note, late_note
-    from avtorch.report.page import written
-    from avtorch.report.window_tables import P_WORDS, alert_table, window_table
-
-    origin = origin_of(
-        [log], window=window, map=map, unit=unit, stamp=stamp, **options | {"setting": [tau, *k], "checkpoint": None}
+    from avtorch.report.estimates import (
+        P_WORDS,
+        alert_table,
+        dead_time_note,
+        estimates_note,
+        late_note,
+        window_table,
     )
+
+    origin = arg.origin_of([log], given)
     notes = () if fit is None else (about_map,)
-
-    def page(staged: Path) -> None:
-        write_pedals(fit, staged)
-        written(estimates_html(found, drive, notes=notes, origin=origin), staged, PAGE)
-
     pictures = {
         "belief.png": lambda: plots.belief_figure(answer["windows"], answer=answer, log=drive),
         "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
     }
-    write_answer(out, "estimates.json", answer, pictures, more=page, also=(PAGE, *PEDAL_FILES))
+    pages = {PAGE: lambda: estimates_html(found, drive, notes=notes, origin=origin)}
+    pedals = lambda staged: write_pedals(fit, staged)  # noqa: E731
+    write_answer(out, "estimates.json", answer, pictures, pages, more=pedals, also=PEDAL_FILES)
     if open_page:
         talk.show(out / PAGE)
     printed = answer | {key: from_start(answer[key], answer["epoch_s"]) for key in ("windows", "alerts")}
     talk.table(window_table(printed["windows"]), most=60)
     talk.lines([P_WORDS], "dim")
     talk.lines([estimates_note(answer)])
-    if printed["alerts"]:
-        talk.table(alert_table(printed["alerts"]))
+    talk.table(alert_table(printed["alerts"]))
     more = (late_note(found.late), dead_time_note(found.inferred), answer["estimator_note"])
     talk.lines([text for text in more if text])
     talk.done(out, answer)

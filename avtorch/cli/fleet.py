@@ -4,30 +4,11 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Group, Parameter
 
-from avtorch.cli.arguments import (
-    COMMAND_LINE,
-    OUTPUT,
-    Columns,
-    Gains,
-    Json,
-    Open,
-    Quiet,
-    Seed,
-    Stamps,
-    TimeGap,
-    Units,
-    free_folder,
-    local_folder,
-    positive,
-    positive_pair,
-    seed_number,
-    three_gains,
-)
+from avtorch.cli import arguments as arg
 from avtorch.cli.diagnose import chosen_effects
 from avtorch.cli.simulators import read_simulator
 from avtorch.cli.talk import Talk
@@ -46,53 +27,45 @@ def fleet(
     logs: list[str],
     /,
     *,
-    out: Annotated[
-        Path,
-        Parameter(
-            name="--out",
-            group=OUTPUT,
-            converter=local_folder,
-            help="Folder of this machine for the rows and the answer.",
-        ),
-    ],
+    out: arg.Out,
     only: Annotated[
         str | None, Parameter(help="Only these steps, STEP,STEP of check, estimate and diagnose; default: all.")
     ] = None,
-    map: Columns = None,
-    unit: Units = None,
-    stamp: Stamps = None,
-    window: Annotated[float, Parameter(help="Length of a window [s].")] = 2.0,
-    estimator: Annotated[
-        Literal["auto", "sgld", "importance", "map", "rls", "ekf", "ukf"],
-        Parameter(help="How a window's posterior is computed; see avtorch estimate --help."),
-    ] = "auto",
-    tau: TimeGap = 1.0,
-    gains: Gains = "1.5,1.5,-0.8",
-    accepted: Annotated[str, Parameter(help="T_L,K_L of the cars as they should be [s, -].")] = "0.3,1.0",
-    dead_time: Annotated[float | None, Parameter(help="Dead time of the cars [s]; default: inferred.")] = None,
+    map: arg.Columns = None,
+    unit: arg.Units = None,
+    stamp: arg.Stamps = None,
+    window: arg.Window = 2.0,
+    estimator: arg.Estimator = "auto",
+    tau: arg.TimeGap = 1.0,
+    gains: arg.Gains = "1.5,1.5,-0.8",
+    accepted: arg.Accepted = "0.3,1.0",
+    dead_time: arg.DeadTime = None,
     target: Annotated[float, Parameter(help="A car with a lower P(string stable) comes first.")] = 0.9,
-    baseline: Annotated[
-        str, Parameter(help="Your simulator: glvd, effects such as dead_time=0.2, or a TOML file.")
-    ] = "glvd",
-    effects: Annotated[str | None, Parameter(help="Only these effects, NAME,NAME,...; default: all.")] = None,
-    pairs: Annotated[bool, Parameter(help="Look for several effects at once.")] = True,
-    budget: Annotated[float | None, Parameter(help="Time for the search of each diagnosis [s]; default: none.")] = None,
+    baseline: arg.Baseline = "glvd",
+    effects: arg.Effects = None,
+    pairs: arg.Pairs = True,
+    budget: arg.Budget = None,
     reports: Annotated[
-        bool, Parameter(negative=(), group=OUTPUT, help="Write the report of each diagnosed log, and link to it.")
+        bool, Parameter(negative=(), group=arg.OUTPUT, help="Write the report of each diagnosed log, and link to it.")
     ] = False,
     retry: Annotated[bool, Parameter(negative=(), help="Try logs again that failed in an earlier run.")] = False,
     workers: Annotated[
-        int | None, Parameter(group=CLUSTER, help="Processes on this machine, one thread each; default: one a core.")
+        int | None,
+        Parameter(
+            group=CLUSTER,
+            validator=arg.at_least(1),
+            help="Processes on this machine, one thread each; default: one a core.",
+        ),
     ] = None,
     memory: Annotated[str, Parameter(group=CLUSTER, help="Most memory of each of them.")] = "2GiB",
     scheduler: Annotated[
         str | None,
         Parameter(group=CLUSTER, help="Address of a running Dask scheduler, such as tcp://10.0.0.1:8786."),
     ] = None,
-    seed: Seed = 0,
-    open_page: Open = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    seed: arg.Seed = 0,
+    open_page: arg.Open = False,
+    json: arg.Json = False,
+    quiet: arg.Quiet = False,
 ) -> None:
     """Check, estimate and diagnose the logs of many cars; which car to look at first.
 
@@ -107,18 +80,10 @@ def fleet(
         with the columns log, car, and if wanted date and others.
     """
     steps = chosen_steps(only)
-    positive("--window", window, "s")
-    positive("--tau", tau, "s")
-    k = three_gains("--gains", gains)
-    sound = positive_pair("--accepted", accepted, "T_L,K_L", "0.3,1.0")
-    if budget is not None:
-        positive("--budget", budget, "s")
-    if workers is not None and workers < 1:
-        raise InputError(f"--workers: found {workers}, needs 1 or more")
+    k = arg.three_gains(gains)
+    sound = arg.accepted_pair(accepted)
     if scheduler is not None and workers is not None:
         raise InputError("--workers: found beside --scheduler, whose workers are its own; needs one of the two")
-    seed_number(seed)
-    free_folder(out)
 
     from avtorch.fleet.cluster import memory_bytes, require_dask
 
@@ -130,6 +95,7 @@ def fleet(
 
     from avtorch.fleet import FleetSettings, find_logs, run_fleet
     from avtorch.report import Origin, write_fleet_page
+    from avtorch.report.fleet import many
 
     page = None
     if reports:
@@ -156,7 +122,7 @@ def fleet(
     talk = Talk(json=json, quiet=quiet)
     found = find_logs(logs, leave_out=out)
     cars = len({log.car for log in found.logs})
-    talk.line(f"{_many(len(found.logs), 'log')} of {_many(cars, 'car')}, {_CAR_FROM[found.car_from]}")
+    talk.line(f"{many(len(found.logs), 'log')} of {many(cars, 'car')}, {_CAR_FROM[found.car_from]}")
 
     def tell(cluster: Cluster) -> None:
         if cluster.dashboard is not None:
@@ -178,7 +144,7 @@ def fleet(
             )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"finished rows are kept in {out}: the same command does what is missing") from None
-    page_path = write_fleet_page(answer, out, origin=Origin.of(COMMAND_LINE.get(), settings=asdict(settings)))
+    page_path = write_fleet_page(answer, out, origin=Origin.of(arg.COMMAND_LINE.get(), settings=asdict(settings)))
     if open_page:
         talk.show(page_path)
     if talk.json:
@@ -207,23 +173,19 @@ def chosen_steps(text: str | None) -> tuple[Step, ...]:
     return tuple(step for step in STEPS if step in names)
 
 
-def _many(count: int, word: str) -> str:
-    return f"{count} {word}{'s' if count != 1 else ''}"
-
-
 def _print(talk: Talk, answer: dict[str, Any]) -> None:
     """The first cars, in the order in which to look at them, and what failed."""
-    from avtorch.report.fleet import failure_table, ranking_table
+    from avtorch.report.fleet import failure_table, many, ranking_table
 
     if talk.silent:
         return
     talk.table(ranking_table(answer["cars"]), most=SHOWN)
-    failures = failure_table(answer)
-    for place, _, _, why in () if failures is None else failures.rows[:5]:
+    failures = failure_table(answer).rows
+    for place, _, _, why in failures[:5]:
         talk.line(f"Failed: {why if place in why or os.path.basename(place) in why else f'{place}: {why}'}")
-    if failures is not None and len(failures.rows) > 5:
-        talk.line(f"... and {_many(len(failures.rows) - 5, 'more log')} failed, see fleet.json")
+    if len(failures) > 5:
+        talk.line(f"... and {many(len(failures) - 5, 'more log')} failed, see fleet.json")
     for note in answer["notes"]:
         talk.line(note)
     done = answer["work"]
-    talk.line(f"\n{_many(done['computed'], 'answer')} computed, {done['kept']} kept from earlier runs.")
+    talk.line(f"\n{many(done['computed'], 'answer')} computed, {done['kept']} kept from earlier runs.")

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from avtorch.cli.arguments import Json, Out, Quiet, Seed, free_folder, seed_number, whole_number
+from avtorch.cli import arguments as arg
 from avtorch.cli.talk import Talk, write_answer
-from avtorch.errors import InputError
 
 if TYPE_CHECKING:
     from avtorch.report.table import Table
@@ -23,15 +22,18 @@ Name = Literal["all", "regions", "estimation", "monitoring", "strategies", "gain
 def paper(
     name: Name = "all",
     *,
-    out: Out,
+    out: arg.Out,
     data: Annotated[
         Path | None,
         Parameter(help="Folder that holds ngsim and the OpenACC platoons; default: AVTORCH_DATA, or US06 without one."),
     ] = None,
-    seeds: Annotated[int, Parameter(converter=whole_number, help="Noise seeds of every setting.")] = 20,
-    seed: Seed = 0,
-    json: Json = False,
-    quiet: Quiet = False,
+    seeds: Annotated[
+        int,
+        Parameter(converter=arg.whole_number, validator=arg.at_least(2), help="Noise seeds of every setting."),
+    ] = 20,
+    seed: arg.Seed = 0,
+    json: arg.Json = False,
+    quiet: arg.Quiet = False,
 ) -> None:
     """Repeat the paper's experiments, and report of each claim: same, better, or not reproduced.
 
@@ -42,10 +44,6 @@ def paper(
     name
         all, or one: stability regions, estimation sweep, monitoring, strategies, what the gains do, a platoon of ten.
     """
-    if seeds < 2:
-        raise InputError(f"--seeds: found {seeds}, needs 2 or more")
-    seed_number(seed)
-    free_folder(out)
     recorded = data or (Path(os.environ["AVTORCH_DATA"]) if os.environ.get("AVTORCH_DATA") else None)
 
     from avtorch.paper import Leaders, reproduce
@@ -83,7 +81,7 @@ def rows_table(answer: Mapping[str, Any]) -> Table:
     from avtorch.report.table import Table
 
     rows = [
-        (f"{row['quantity']}\n{row['setting']}", formatted(row["paper"]), here(row), row["verdict"])
+        (f"{row['quantity']} ({row['setting']})", formatted(row["paper"]), here(row), row["verdict"])
         for row in answer["rows"]
     ]
     soft = [i for i, row in enumerate(answer["rows"]) if row["verdict"] == "not reproduced"]

@@ -68,12 +68,11 @@ def _steepest(table: PedalTable) -> float:
 
 
 def _range(name: str, knots: FloatArray) -> str:
-    from avtorch.pedals.pedal_map import unit_of
+    from avtorch.plots.pedals import shown_unit
 
     low, high = float(knots[0]), float(knots[-1])
-    unit = unit_of(name, high)
-    size, shown = {"-": (100.0, "%"), "Pa": (1e-5, "bar")}.get(unit, (1.0, unit.replace("2", "²")))
-    return f"{size * low:.3g} to {size * high:.3g} {shown}"
+    size, unit = shown_unit(name, high)
+    return f"{size * low:.3g} to {size * high:.3g} {unit}"
 
 
 def write_pedals(fit: PedalFit | None, staged: Path) -> list[Path]:

@@ -9,22 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from avtorch.cli.arguments import (
-    Gain,
-    Json,
-    Lag,
-    Open,
-    Out,
-    Quiet,
-    Seed,
-    free_folder,
-    limits_pair,
-    not_negative,
-    origin_of,
-    positive,
-    seed_number,
-    whole_number,
-)
+from avtorch.cli import arguments as arg
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
@@ -45,16 +30,21 @@ def run(
     *,
     leader: Annotated[Path | None, Parameter(help="Recorded leader (OpenACC, NGSIM, I-24, CSV); default US06.")] = None,
     vehicle: Annotated[
-        int | None, Parameter(converter=whole_number, help="Which vehicle of the leader's file.")
+        int | None, Parameter(converter=arg.whole_number, help="Which vehicle of the leader's file.")
     ] = None,
     event: Annotated[
-        int | None, Parameter(converter=whole_number, help="Which event of the leader's file (NGSIM).")
+        int | None, Parameter(converter=arg.whole_number, help="Which event of the leader's file (NGSIM).")
     ] = None,
-    duration: Annotated[float | None, Parameter(help="Length of the run [s]; default 80, or the leader's.")] = None,
-    window: Annotated[float, Parameter(help="Length of a window [s].")] = 2.0,
-    change_at: Annotated[float, Parameter(help="When the vehicle changes [s].")] = 26.0,
-    T: Annotated[Lag, Parameter(help="Actuation lag T_L from the change on [s].")] = 1.5,
-    K: Annotated[Gain, Parameter(help="Actuation gain K_L from the change on [-].")] = 0.5,
+    duration: Annotated[
+        float | None,
+        Parameter(validator=arg.above_zero("s"), help="Length of the run [s]; default 80, or the leader's."),
+    ] = None,
+    window: arg.Window = 2.0,
+    change_at: Annotated[
+        float, Parameter(validator=arg.zero_or_more("s"), help="When the vehicle changes [s].")
+    ] = 26.0,
+    T: Annotated[arg.Lag, Parameter(help="Actuation lag T_L from the change on [s].")] = 1.5,
+    K: Annotated[arg.Gain, Parameter(help="Actuation gain K_L from the change on [-].")] = 0.5,
     strategy: Annotated[
         Literal["auto", "1", "2", "3", "none"],
         Parameter(
@@ -62,26 +52,21 @@ def run(
         ),
     ] = "auto",
     controller: Annotated[Literal["linear", "mpc"], Parameter(help="Upper level.")] = "linear",
-    noise: Annotated[float, Parameter(help="Jerk noise [m/s³].")] = 0.1,
+    noise: Annotated[float, Parameter(validator=arg.zero_or_more("m/s³"), help="Jerk noise [m/s³].")] = 0.1,
     limits: Annotated[str, Parameter(help="Least and greatest command MIN,MAX [m/s²].")] = "-6,4",
-    seed: Seed = 0,
-    out: Out,
-    open_page: Open = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    seed: arg.Seed = 0,
+    out: arg.Out,
+    open_page: arg.Open = False,
+    json: arg.Json = False,
+    quiet: arg.Quiet = False,
 ) -> None:
     """Simulate a follower whose vehicle changes: estimate, detect the change, act.
 
     The same drive without any action, under the same noise, stands beside it.
     """
-    positive("--T", T, "s")
-    positive("--K", K)
-    positive("--window", window, "s")
-    not_negative("--noise", noise, "m/s³")
-    not_negative("--change-at", change_at, "s")
-    low, high = limits_pair("--limits", limits)
-    seed_number(seed)
-    free_folder(out, without="estimates.json")
+    given = dict(locals())
+    low, high = arg.limits_pair(limits)
+    arg.folder_without(out, "estimates.json")
     if controller == "mpc" and strategy == "3":
         raise InputError("--strategy: found 3 with --controller mpc, needs auto, 1, 2 or none")
     if leader is None and (vehicle is not None or event is not None):
@@ -110,27 +95,13 @@ def run(
     talk = Talk(json=json, quiet=quiet)
     with talk.progress("Driving") as step:
         supervisor = Supervisor(fresh(), window=window, strategist=_strategist(strategy, controller), seed=seed)
-        acting = supervisor.run(
-            seconds,
-            events=[(change_at, change)],
-            progress=lambda done, _: step(done, (1 if strategy == "none" else 2) * seconds),
-        )
-        alone = acting.rows if strategy == "none" else _unwatched(fresh(), seconds, change_at, change, step)
+        acting = supervisor.run(seconds, events=[(change_at, change)], progress=step)
+        alone = acting.rows if strategy == "none" else _unwatched(fresh(), seconds, change_at, change)
 
     from avtorch.results import run_answer
 
     answer = run_answer(acting, alone, change=(change_at, T, K), time_gap=float(supervisor.default.time_gap[0]))
-    origin = origin_of(
-        [] if leader is None else [leader],
-        leader={"vehicle": vehicle, "event": event, "duration": seconds},
-        change=[change_at, T, K],
-        window=window,
-        noise=noise,
-        limits=[low, high],
-        controller=controller,
-        strategy=strategy,
-        seed=seed,
-    )
+    origin = arg.origin_of([] if leader is None else [leader], given)
     _write(out, answer, acting, alone, acts=strategy != "none", vehicle=(T, K), change_at=change_at, origin=origin)
     if open_page:
         talk.show(out / PAGE)
@@ -141,7 +112,6 @@ def run(
 def _length(duration: float | None, leader: Leader) -> float:
     if duration is None:
         return min(DURATION_S, math.floor(leader.duration * 100 + 1e-6) / 100)
-    positive("--duration", duration, "s")
     if duration > leader.duration:
         raise InputError(
             f"--duration: found {duration:g} s, needs at most {leader.duration:g} s, all there is of {leader.name}"
@@ -163,24 +133,14 @@ def _strategist(strategy: str, controller: str) -> Strategist | None:
     return Strategist(Grid(allowed=ALLOWED[strategy]))
 
 
-def _unwatched(
-    loop: ClosedLoop,
-    seconds: float,
-    change_at: float,
-    change: Callable[[ClosedLoop], None],
-    step: Callable[[float, float], None],
-) -> Block:
-    """The same drive without a monitor, in blocks so that the progress bar moves."""
+def _unwatched(loop: ClosedLoop, seconds: float, change_at: float, change: Callable[[ClosedLoop], None]) -> Block:
+    """The same drive without a monitor."""
     from avtorch.vehicle import Block
 
-    end, turn, blocks = round(seconds / loop.dt), round(change_at / loop.dt), []
-    while loop.steps_done < end:
-        if loop.steps_done == turn:
-            change(loop)
-        until = turn if loop.steps_done < turn else end
-        blocks.append(loop.advance(min(500, until - loop.steps_done)))
-        step(seconds + loop.time, 2 * seconds)
-    return Block.concatenate(blocks)
+    turn = round(change_at / loop.dt)
+    before = [loop.advance(turn)] if turn else []
+    change(loop)
+    return Block.concatenate([*before, loop.advance(round(seconds / loop.dt) - turn)])
 
 
 def _write(
@@ -196,7 +156,6 @@ def _write(
 ) -> None:
     from avtorch import plots
     from avtorch.report import run_html
-    from avtorch.report.page import written
     from avtorch.report.run import Regions
 
     time, rows = acting.rows.time, acting.rows
@@ -216,19 +175,14 @@ def _write(
         "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
         "region.png": lambda: plots.region_figure(settings, clouds, truth=vehicle),
     }
-    regions = Regions(settings, clouds)
-
-    def page(staged: Path) -> None:
-        html = run_html(answer, time, traces, truth=truth, bounds=BOUNDS, regions=regions, origin=origin)
-        written(html, staged, PAGE)
-
-    write_answer(out, "run.json", answer, pictures, more=page, also=(PAGE,))
+    more: Any = {"truth": truth, "bounds": BOUNDS, "regions": Regions(settings, clouds), "origin": origin}
+    write_answer(out, "run.json", answer, pictures, {PAGE: lambda: run_html(answer, time, traces, **more)})
 
 
 def _print(talk: Talk, answer: dict[str, Any]) -> None:
     """The events of a run in order, its windows, and how much the action helped."""
+    from avtorch.report.estimates import P_WORDS, window_table
     from avtorch.report.run import collision, performance_table, story_table
-    from avtorch.report.window_tables import P_WORDS, window_table
 
     talk.table(window_table(answer["windows"]), most=60)
     talk.lines([P_WORDS, ""], "dim")

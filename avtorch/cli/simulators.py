@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Group, Parameter
 from rich.markup import escape
 
-from avtorch.cli.arguments import Json, Quiet
+from avtorch.cli import arguments as arg
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError, quoted
 
@@ -187,8 +187,8 @@ def check_simulator(
     delay: Annotated[float | None, Parameter(group=BELIEVED, help="Dead time [s].")] = None,
     step: Annotated[float, Parameter(help="Step of the manoeuvres [s].")] = 0.02,
     mapping: Annotated[Path | None, Parameter(help="TOML file with an FMU's variables.")] = None,
-    json: Json = False,
-    quiet: Quiet = False,
+    json: arg.Json = False,
+    quiet: arg.Quiet = False,
 ) -> None:
     """Is a simulator what you set? Drives it through steps and a sweep, and says what it is made of.
 

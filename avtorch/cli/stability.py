@@ -8,43 +8,36 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from avtorch.cli.arguments import (
-    Gain,
-    Gains,
-    Json,
-    Lag,
-    Out,
-    Quiet,
-    TimeGap,
-    free_folder,
-    not_negative,
-    positive,
-    three_gains,
-    two_axes,
-)
+from avtorch.cli import arguments as arg
 from avtorch.cli.talk import Talk, write_answer
+from avtorch.errors import InputError, quoted
+
+_AXES = {
+    "k_s": (0.05, 4.0),
+    "k_v": (0.0, 4.0),
+    "k_a": (-3.0, 0.9),
+    "tau": (0.1, 3.0),
+    "T": (0.02, 2.0),
+    "K": (0.2, 1.3),
+}
+"""Usual limits of each axis of a region."""
 
 
 def stability(
     *,
-    T: Lag = 0.3,
-    K: Gain = 1.0,
-    tau: TimeGap = 1.0,
-    gains: Gains = "1.5,1.5,-0.8",
-    dead_time: Annotated[float, Parameter(name="--dead-time", help="Dead time in the chain [s].")] = 0.0,
-    plane: Annotated[str, Parameter(help="Axes of the region: two out of k_s, k_v, k_a, tau, T, K.")] = "T,K",
-    out: Out = Path("out/stability"),
-    json: Json = False,
-    quiet: Quiet = False,
+    T: arg.Lag = 0.3,
+    K: arg.Gain = 1.0,
+    tau: Annotated[float, Parameter(validator=arg.zero_or_more("s"), help="Time gap [s].")] = 1.0,
+    gains: arg.Gains = "1.5,1.5,-0.8",
+    dead_time: Annotated[float, Parameter(validator=arg.zero_or_more("s"), help="Dead time in the chain [s].")] = 0.0,
+    plane: Annotated[str, Parameter(help=f"Axes of the region: two out of {', '.join(_AXES)}.")] = "T,K",
+    out: arg.Out = Path("out/stability"),
+    json: arg.Json = False,
+    quiet: arg.Quiet = False,
 ) -> None:
     """Is one setting stable and string stable: conditions, exact verdict, peak gain, region."""
-    positive("--T", T, "s")
-    positive("--K", K)
-    not_negative("--tau", tau, "s")
-    not_negative("--dead-time", dead_time, "s")
-    k = three_gains("--gains", gains)
-    free_folder(out)
-    axes = two_axes(plane)
+    k = arg.three_gains(gains)
+    axes = _two_axes(plane)
 
     import torch
 
@@ -97,15 +90,15 @@ def _print(talk: Talk, answer: Mapping[str, Any]) -> None:
     talk.lines([f"dead time left   {answer['dead_time_margin_s']:.3f} s before local instability"])
 
 
+def _two_axes(text: str) -> tuple[str, str]:
+    names = tuple(part.strip() for part in text.split(","))
+    if len(names) != 2 or names[0] == names[1] or not set(names) <= set(_AXES):
+        needs = f"two different names out of {', '.join(_AXES)} such as tau,T"
+        raise InputError(f"--plane: found {quoted(text)}, needs {needs}")
+    return names[0], names[1]
+
+
 def _around(name: str, value: float) -> tuple[float, float]:
     """Limits of an axis that contain the setting and the settings that could replace it."""
-    usual = {
-        "T": (0.02, 2.0),
-        "K": (0.2, 1.3),
-        "tau": (0.1, 3.0),
-        "k_s": (0.05, 4.0),
-        "k_v": (0.0, 4.0),
-        "k_a": (-3.0, 0.9),
-    }
-    low, high = usual[name]
+    low, high = _AXES[name]
     return min(low, value - 0.1 * abs(value)), max(high, value + 0.3 * abs(value))

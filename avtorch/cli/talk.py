@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import time
 import webbrowser
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn
 from rich.segment import Segment
 from rich.table import Table as Drawn
 
@@ -42,39 +40,6 @@ class SafeConsole(Console):
             yield segment
 
 
-class ProgressLines:
-    """Called with (done, of), and a stage where there are several, prints a line on `console` every `EVERY_S`.
-
-    What comes before anything is done, such as a simulator that is driven first, tells its own time after a comma: that
-    is printed as it begins, and the time left is counted from its end.
-    """
-
-    def __init__(self, console: Console, what: str) -> None:
-        self.console, self.what = console, what
-        self._begun = self._last = time.monotonic()
-        self._before: str | None = None
-
-    def left_s(self, done: float, of: float) -> float | None:
-        """Time that is left [s] if it goes on as before; None where that is not known yet."""
-        if done == 0:
-            self._begun = time.monotonic()
-        return (time.monotonic() - self._begun) * (of - done) / done if 0 < done < of else None
-
-    def __call__(self, done: float, of: float, stage: str | None = None) -> None:
-        now = time.monotonic()
-        if done == 0:
-            self._begun = now
-            if stage is not None and "," in stage and stage != self._before:
-                self._before, self._last = stage, now
-                self.console.print(f"{self.what}: {stage}", markup=False, soft_wrap=True)
-        if now - self._last < EVERY_S or not 0 < done < of:
-            return
-        self._last = now
-        left = (now - self._begun) * (of - done) / done
-        of_what = "" if stage is None else f" ({stage})"
-        self.console.print(f"{self.what}: {100 * done / of:.0f} %, about {left:.0f} s left{of_what}", markup=False)
-
-
 class Talk:
     """Prints tables and progress. With `json` it prints the answer in place of the tables; with `quiet` nothing."""
 
@@ -84,29 +49,19 @@ class Talk:
         self.err = SafeConsole(stderr=True, quiet=self.silent, highlight=False)
 
     @contextmanager
-    def progress(self, what: str, most_s: float | None = None) -> Iterator[Callable[..., None]]:
+    def progress(self, what: str) -> Iterator[Callable[..., None]]:
         """A bar with the time left on stderr where it is a terminal, and a line now and then where it is not; yields a
-        function of (done, of), or of (stage, done, of) where there are stages. `most_s`: time at most [s]."""
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.percentage:>3.0f} %{task.fields[left]}"),
-            TextColumn("" if most_s is None else f"of {most_s:g} s at most"),
-        )
-        with Progress(*columns, console=self.err, transient=True, disable=not self.err.is_terminal) as bar:
-            task = bar.add_task(what, total=None, left="")
-            lines = ProgressLines(self.err, what)
+        function of (done, of), or of (stage, done, of) where there are stages."""
+        # not before a command works: the package needs NumPy
+        from avtorch.display.progress import Lines, Steps, TerminalBar
 
-            def step(*told: Any) -> None:
-                *stage, done, of = told
-                if not self.err.is_terminal:
-                    lines(done, of, *stage)
-                    return
-                left = lines.left_s(done, of)
-                text = "" if left is None else f", about {left:.0f} s left"
-                bar.update(task, description=": ".join([what, *stage]), completed=done, total=of, left=text)
-
-            yield step
+        terminal = self.err.is_terminal and not self.silent
+        lines = Lines(lambda text: self.err.print(text, markup=False, soft_wrap=True))
+        bar = TerminalBar(self.err) if terminal else lines
+        try:
+            yield Steps(what, bar, None if terminal else EVERY_S)
+        finally:
+            bar.close()
 
     @contextmanager
     def waiting(self, what: str) -> Iterator[None]:
@@ -134,7 +89,9 @@ class Talk:
             self.out.print(line, style=style, markup=False)
 
     def table(self, table: Table, most: int | None = None) -> None:
-        """A table of the page, `most` rows of it, and an empty line."""
+        """A table of the page, `most` rows of it, and an empty line; nothing of one without rows."""
+        if not table.rows:
+            return
         self.out.print(drawn(table, most))
         more = 0 if most is None else len(table.rows) - most
         if more > 0:
@@ -201,18 +158,23 @@ def write_answer(
     out: Path,
     name: str,
     answer: Mapping[str, Any],
-    pictures: Mapping[str, Callable[[], Any]],
+    pictures: Mapping[str, Callable[[], Any]] | None = None,
+    pages: Mapping[str, Callable[[], str]] | None = None,
     *,
     more: Callable[[Path], object] = lambda staged: None,
     also: Sequence[str] = (),
 ) -> None:
-    """Publish the answer and its pictures as one set; `more` writes further files into it, out of `also`, the files
-    that an earlier answer of this kind may have left."""
+    """Publish the answer, its pictures and its pages as one set; `more` writes further files into it, out of `also`,
+    the files that an earlier answer of this kind may have left."""
     from avtorch.io import answer_set, write_json
     from avtorch.plots import save
+    from avtorch.report.page import written
 
-    with answer_set(out, list(dict.fromkeys([name, *pictures, *also]))) as staged:
+    pictures, pages = pictures or {}, pages or {}
+    with answer_set(out, list(dict.fromkeys([name, *pictures, *pages, *also]))) as staged:
         for file, draw in pictures.items():
             save(draw(), staged / file)
+        for file, page in pages.items():
+            written(page(), staged, file)
         more(staged)
         write_json(staged / name, answer)

@@ -9,22 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from avtorch.cli.arguments import (
-    Columns,
-    Json,
-    Open,
-    Out,
-    Quiet,
-    Seed,
-    Stamps,
-    Units,
-    free_folder,
-    not_negative,
-    origin_of,
-    positive,
-    seed_number,
-    whole_number,
-)
+from avtorch.cli import arguments as arg
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
@@ -47,26 +32,39 @@ def validate(
         bool, Parameter(negative=(), help="Windows of simulated vehicles, slow to quick, in place of a log.")
     ] = False,
     windows: Annotated[
-        int | None, Parameter(converter=whole_number, help="Number of windows; 200 synthetic ones, or all of a log.")
+        int | None,
+        Parameter(
+            converter=arg.whole_number,
+            validator=arg.at_least(1),
+            help="Number of windows; 200 synthetic ones, or all of a log.",
+        ),
     ] = None,
-    window: Annotated[float, Parameter(help="Length of a log's windows [s].")] = 2.0,
-    out: Out,
+    window: arg.Window = 2.0,
+    out: arg.Out,
     nuts_windows: Annotated[
         int | None,
         Parameter(
-            converter=whole_number, help="Number of windows that NUTS samples; 3, or 1 without jerk (minutes each)."
+            converter=arg.whole_number,
+            validator=arg.at_least(1),
+            help="Number of windows that NUTS samples; 3, or 1 without jerk (minutes each).",
         ),
     ] = None,
-    spread: Annotated[float, Parameter(help="Posterior SDs around the mode at which chains start.")] = 0.0,
-    chains: Annotated[int | None, Parameter(converter=whole_number, help="SGLD chains per window.")] = None,
-    draws: Annotated[int | None, Parameter(converter=whole_number, help="Draws kept of each chain.")] = None,
-    map: Columns = None,
-    unit: Units = None,
-    stamp: Stamps = None,
-    seed: Seed = 0,
-    open_page: Open = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    spread: Annotated[
+        float,
+        Parameter(validator=arg.zero_or_more(), help="Posterior SDs around the mode at which chains start."),
+    ] = 0.0,
+    chains: Annotated[
+        int | None,
+        Parameter(converter=arg.whole_number, validator=arg.at_least(1), help="SGLD chains per window."),
+    ] = None,
+    draws: Annotated[int | None, Parameter(converter=arg.whole_number, help="Draws kept of each chain.")] = None,
+    map: arg.Columns = None,
+    unit: arg.Units = None,
+    stamp: arg.Stamps = None,
+    seed: arg.Seed = 0,
+    open_page: arg.Open = False,
+    json: arg.Json = False,
+    quiet: arg.Quiet = False,
 ) -> None:
     """Do SGLD's posteriors agree with exact quadrature and with NUTS?
 
@@ -77,24 +75,18 @@ def validate(
     log
         A log, as for estimate. Without measured jerk there is no quadrature, and NUTS is the reference.
     """
+    arguments = dict(locals())
     if synthetic and log is not None:
         raise InputError(f"--synthetic: found together with {log}; needs one of a log and --synthetic")
     if not synthetic and log is None:
         raise InputError("log: neither a log nor --synthetic was given; needs one of them")
     if synthetic and (map or unit or stamp):
         raise InputError("--map, --unit, --stamp: found with --synthetic; they name the columns of a log")
-    for name, value in (("--windows", windows), ("--nuts-windows", nuts_windows), ("--chains", chains)):
-        if value is not None and value < 1:
-            raise InputError(f"{name}: found {value}, needs 1 or more")
-    positive("--window", window, "s")
-    not_negative("--spread", spread)
-    free_folder(out)
-    seed_number(seed)
 
     from avtorch.validation.validate import check_installed
 
     check_installed()
-    from avtorch.io import Log, answer_set, check
+    from avtorch.io import Log, check
     from avtorch.results import validation_answer
     from avtorch.validation import synthetic_windows, windows_of_log
     from avtorch.validation import validate as work
@@ -111,19 +103,16 @@ def validate(
     with talk.progress("Validating") as step:
         found = work(source, settings=settings, nuts_windows=nuts_windows, seed=seed, progress=step)
     answer = validation_answer(found)
-    given_settings = {"map": map, "unit": unit, "stamp": stamp, "window": window, "windows": windows, **given}
-    more = {"spread": spread, "nuts_windows": nuts_windows, "synthetic": synthetic, "seed": seed}
-    origin = origin_of([] if log is None else [log], **given_settings, **more)
+    origin = arg.origin_of([] if log is None else [log], arguments)
 
     from avtorch import plots
-    from avtorch.report.page import written
     from avtorch.report.validation import validation_html, validation_notes, validation_table
 
     groups = found.to_arviz()
-    with answer_set(out, ("validation.json", PAGE, *plots.VALIDATION_PICTURES, *EXPORTS)) as staged:
-        export(staged, groups)
-        written(validation_html(found, origin=origin), staged, PAGE)
-        write_answer(staged, "validation.json", answer, plots.validation_figures(found))
+    pages = {PAGE: lambda: validation_html(found, origin=origin)}
+    files = (*plots.VALIDATION_PICTURES, *EXPORTS)
+    nets = lambda staged: export(staged, groups)  # noqa: E731
+    write_answer(out, "validation.json", answer, plots.validation_figures(found), pages, more=nets, also=files)
     if open_page:
         talk.show(out / PAGE)
     talk.table(validation_table(answer))

@@ -14,22 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Group, Parameter
 
-from avtorch.cli.arguments import (
-    OUTPUT,
-    Gains,
-    Quiet,
-    Seed,
-    TimeGap,
-    free_folder,
-    is_address,
-    local_folder,
-    not_negative,
-    positive,
-    positive_pair,
-    seed_number,
-    three_gains,
-    whole_number,
-)
+from avtorch.cli import arguments as arg
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError, quoted
 
@@ -48,30 +33,30 @@ def watch(
     ] = False,
     rate: Annotated[
         float | None,
-        Parameter(group=SOURCE, help="Play a recording this many times faster than recorded; default: at once."),
+        Parameter(
+            group=SOURCE,
+            validator=arg.above_zero(),
+            help="Play a recording this many times faster than recorded; default: at once.",
+        ),
     ] = None,
     car: Annotated[
         str | None, Parameter(group=SOURCE, help="Name of the car where rows have none; default: car, or the file's.")
     ] = None,
-    map: Annotated[
-        list[str] | None,
-        Parameter(negative=(), group=SOURCE, help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
-    ] = None,
-    unit: Annotated[
-        list[str] | None,
-        Parameter(negative=(), group=SOURCE, help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable."),
-    ] = None,
+    map: arg.Columns = None,
+    unit: arg.Units = None,
     lateness: Annotated[
-        float, Parameter(group=SOURCE, help="How far a row may come behind newer ones and still count [s].")
+        float,
+        Parameter(
+            group=SOURCE,
+            validator=arg.zero_or_more("s"),
+            help="How far a row may come behind newer ones and still count [s].",
+        ),
     ] = 0.05,
     cars: Annotated[
-        int, Parameter(group=SOURCE, converter=whole_number, help="Cars at most; rows of others are counted.")
+        int, Parameter(group=SOURCE, converter=arg.whole_number, help="Cars at most; rows of others are counted.")
     ] = 1000,
-    window: Annotated[float, Parameter(help="Length of a window [s].")] = 2.0,
-    form: Annotated[
-        Literal["auto", "jerk", "latent"],
-        Parameter(help="Likelihood: of measured jerk, or of noisy acceleration and speed."),
-    ] = "auto",
+    window: arg.Window = 2.0,
+    form: arg.Form = "auto",
     estimator: Annotated[
         Literal["auto", "map", "sgld", "importance"],
         Parameter(
@@ -79,30 +64,27 @@ def watch(
             "sampling."
         ),
     ] = "auto",
-    mode: Annotated[
-        Literal["lambda", "posterior", "forgetting"],
-        Parameter(help="How a posterior becomes the next prior."),
-    ] = "lambda",
-    tau: TimeGap = 1.0,
-    gains: Gains = "1.5,1.5,-0.8",
-    accepted: Annotated[str, Parameter(help="T_L,K_L of the cars as they should be [s, -].")] = "0.3,1.0",
-    seed: Seed = 0,
+    mode: arg.Mode = "lambda",
+    tau: arg.TimeGap = 1.0,
+    gains: arg.Gains = "1.5,1.5,-0.8",
+    accepted: arg.Accepted = "0.3,1.0",
+    seed: arg.Seed = 0,
     state: Annotated[
         Path | None,
         Parameter(
-            group=OUTPUT,
-            converter=local_folder,
+            group=arg.OUTPUT,
+            converter=arg.local_folder,
             help="Folder for the cars' states; the same command goes on from there.",
         ),
     ] = None,
     out: Annotated[
         str | None,
-        Parameter(group=OUTPUT, help="File or mqtt://HOST:PORT/TOPIC for the answers; default: standard output."),
+        Parameter(group=arg.OUTPUT, help="File or mqtt://HOST:PORT/TOPIC for the answers; default: standard output."),
     ] = None,
     prometheus: Annotated[
-        str | None, Parameter(group=OUTPUT, help="[HOST:]PORT for metrics; the host is 127.0.0.1 by default.")
+        str | None, Parameter(group=arg.OUTPUT, help="[HOST:]PORT for metrics; the host is 127.0.0.1 by default.")
     ] = None,
-    quiet: Quiet = False,
+    quiet: arg.Quiet = False,
 ) -> None:
     """Watch cars while they drive: belief, alerts and P(string stable) of every window, one line of JSON each.
 
@@ -116,17 +98,11 @@ def watch(
         is played back; or mqtt://HOST:PORT/TOPIC. A row has time, accel_cmd, accel or speed, and car where there are
         several.
     """
-    positive("--window", window, "s")
-    positive("--tau", tau, "s")
-    not_negative("--lateness", lateness, "s")
-    if rate is not None:
-        positive("--rate", rate)
-    k = three_gains("--gains", gains)
-    sound = positive_pair("--accepted", accepted, "T_L,K_L", "0.3,1.0")
-    seed_number(seed)
+    k = arg.three_gains(gains)
+    sound = arg.accepted_pair(accepted)
     address = None if prometheus is None else host_and_port(prometheus)
     if state is not None:
-        free_folder(state)
+        arg.free_folder(state)
 
     from avtorch.live import Counts, KeptCars, LineParser, LiveSettings, LiveWatch, Metrics, watch_source
 
@@ -217,7 +193,7 @@ def _sink(out: str | None, kept: KeptCars | None, stop: Event, source: str) -> S
         return LineSink()
     if is_mqtt(out):
         return MqttSink(MqttAddress.of(out), stop)
-    if is_address(out):
+    if arg.is_address(out):
         raise InputError(f"--out: found {quoted(out)}; needs a file of this machine, or mqtt://HOST:PORT/TOPIC")
     if _are_one_file(source, out):
         raise InputError(f"--out: {quoted(out)} is the source itself; needs another name")

@@ -10,8 +10,7 @@ Example:
     '<div>'
 """
 
-from avtorch.display.card import Card, Displayed
-from avtorch.display.frame import Frame
+from avtorch.display.frame import Card, Displayed, Frame
 from avtorch.display.notebook import show
 from avtorch.display.progress import progress_bar
 

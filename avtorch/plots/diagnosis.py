@@ -25,6 +25,7 @@ from avtorch.plots.style import (
     BLACK,
     BLUE,
     GREY,
+    LABELS,
     NARROW,
     ORANGE,
     SKY,
@@ -36,8 +37,8 @@ from avtorch.plots.style import (
 )
 
 _CELLS = 24  # a side of the force map
+_MOST = 7  # hypotheses in a picture
 _SECONDS = 25.0  # seconds of a drive in a picture
-_NAMES = {"accel": "acceleration [m/s²]", "speed": "speed [m/s]"}
 
 
 def budget_bars(ax: Axes, budget: Budget, *, narrow: bool = False) -> Axes:
@@ -117,7 +118,7 @@ def traces_of(found: Diagnosis) -> Traces:
     return found.traces
 
 
-def stretch_of(found: Diagnosis, *, seconds: float = _SECONDS) -> DriveStretch:
+def stretch_of(found: Diagnosis) -> DriveStretch:
     """What was measured, and what is simulated before and after the repair, where the effect does most.
 
     The channel is the acceleration, unless only the speed shows it. Raises `InputError` where there are no traces.
@@ -127,32 +128,18 @@ def stretch_of(found: Diagnosis, *, seconds: float = _SECONDS) -> DriveStretch:
     shows = errors[0] / np.maximum(errors[1], 1e-12)
     # unlike the speed, the acceleration shows an event at its own time
     k = 0 if shows[0] > 1.1 else int(np.argmax(shows))
-    if traces.channels[k] == "speed":
-        seconds = min(seconds, HORIZON_S)  # beyond which a simulated speed may be anywhere
+    of_speed = traces.channels[k] == "speed"
+    # beyond the horizon a simulated speed may be anywhere
+    seconds = min(_SECONDS, HORIZON_S) if of_speed else _SECONDS
     inside = _liveliest(traces.time, traces.stretch, np.abs(traces.before[k] - traces.after[k]), seconds)
-    offset = np.zeros(2)
-    if traces.channels[k] == "speed":
-        # a rollout begun at the measured speed
-        offset = np.array([(traces.measured[k] - x[k])[inside][0] for x in (traces.before, traces.after)])
+    # a rollout begun at the measured speed
+    offset = [(traces.measured[k] - x[k])[inside][0] if of_speed else 0.0 for x in (traces.before, traces.after)]
     lines = {"measured": traces.measured[k][inside], "baseline simulator": traces.before[k][inside] + offset[0]}
     if found.winner.effects:
         named = found.verdict.names
         label = f"with {' and '.join(named)}" if len(named) < 3 else f"with all {len(named)} effects"
         lines[label] = traces.after[k][inside] + offset[1]
-    return DriveStretch(_NAMES[traces.channels[k]], traces.time[inside], lines)
-
-
-def gap_on_the_road(ax: Axes, found: Diagnosis, *, seconds: float = _SECONDS) -> Axes:
-    """The lines of `stretch_of` over time. Raises `InputError` where there are no traces."""
-    stretch = stretch_of(found, seconds=seconds)
-    for (label, values), colour in zip(stretch.lines.items(), (BLACK, VERMILLION, BLUE), strict=False):
-        ax.plot(stretch.time, values, color=colour, lw=1.2 if colour == BLACK else None, label=label)
-    ax.set(
-        xlabel=time_label(found.log.epochs_s[0] if len(found.log.epochs_s) == 1 else 0.0),
-        ylabel=stretch.axis,
-    )
-    ax.margins(x=0)
-    return ax
+    return DriveStretch(LABELS[traces.channels[k]], traces.time[inside], lines)
 
 
 def _liveliest(time: FloatArray, stretch: IntArray, size: FloatArray, seconds: float) -> slice:
@@ -170,6 +157,11 @@ def _liveliest(time: FloatArray, stretch: IntArray, size: FloatArray, seconds: f
     return best
 
 
+def axes_of(found: Diagnosis) -> list[Axis]:
+    """Along which a gap may lie: those that the log has. Raises `InputError` where there are no traces."""
+    return ["time", "command"] if traces_of(found).speed is None else ["time", "speed", "command"]
+
+
 @dataclass(frozen=True)
 class EffectHistogram:
     """Along an axis: the shares of the rows and of the effect's response between `edges` (bin + 1,), each (bin,)."""
@@ -180,14 +172,10 @@ class EffectHistogram:
 
 
 def histogram_of(found: Diagnosis, axis: Axis, *, bins: int = 30) -> EffectHistogram:
-    """Where along `axis` (time, speed or command) the drive and the effect's response are.
-
-    Raises `InputError` where there are no traces or the log has no such signal.
-    """
+    """Where along one of `axes_of` the drive and the effect's response are."""
     traces = traces_of(found)
-    x = {"time": traces.time, "command": traces.command, "speed": traces.speed}.get(axis)
-    if x is None:
-        raise InputError(f"axis: found {axis!r}, needs time, command, or speed where it was measured")
+    x = {"time": traces.time, "command": traces.command, "speed": traces.speed}[axis]
+    assert x is not None, "one of axes_of"
     low, high = np.quantile(x, (0.002, 0.998))
     edges = np.linspace(low, high if high > low else low + 1, bins + 1)
     rows, _ = np.histogram(x, edges)
@@ -196,74 +184,11 @@ def histogram_of(found: Diagnosis, axis: Axis, *, bins: int = 30) -> EffectHisto
     return EffectHistogram(edges, rows / max(rows.sum(), 1), does / whole if whole > 0 else np.zeros(bins))
 
 
-def where_it_lies(ax: Axes, found: Diagnosis, axis: Axis) -> Axes:
-    """Along `axis` (time, speed or command): the shares of `histogram_of` and the named parts.
-
-    Raises `InputError` where there are no traces or the log has no such signal.
-    """
-    shares = histogram_of(found, axis)
-    ax.stairs(shares.rows, shares.edges, fill=True, facecolor="#DDDDDD", edgecolor=GREY, lw=0.8, label="the drive")
-    if shares.effect.any():
-        ax.stairs(shares.effect, shares.edges, color=BLUE, lw=1.6, label="the effect")
-    for part in found.where:
-        if part.axis == axis and not isinstance(part.begin, str) and not isinstance(part.end, str):
-            away = found.log.epochs_s[0] if axis == "time" else 0.0
-            ax.axvspan(
-                part.begin - away, part.end - away, color=ORANGE, alpha=0.18, lw=0, label="named part of the gap"
-            )
-    ax.set(xlabel=f"{axis} [{UNITS[axis]}]", ylabel="share", ylim=(0, None))
-    ax.margins(x=0)
-    return ax
-
-
-def probabilities(ax: Axes, found: Diagnosis, *, most: int = 7, narrow: bool = False) -> Axes:
-    """One bar per candidate, the most probable first; the alias set in blue, the rest in grey.
-
-    `narrow`: names above their bars rather than beside them.
-    """
-    some = list(found.candidates[:most])[::-1]
-    colours = [BLUE if c.name in found.verdict.alias_set else "#BBBBBB" for c in some]
-    ax.barh(range(len(some)), [c.probability for c in some], color=colours, height=_height(narrow))
-    _name_bars(ax, [_label(c, "" if narrow else "\n") for c in some], narrow=narrow, down=False)
-    for i, c in enumerate(some):
-        ax.text(c.probability + 0.01, i, f"{c.probability:.2f}", va="center", fontsize=9, color=BLACK)
-    ax.set_xticks(_UP_TO_ONE)
-    ax.set(xlabel="probability", xlim=(0, 1.2 if narrow else 1.1))
-    ax.set_ylim(-0.5, len(some) - (0.2 if narrow else 0.5))
-    ax.grid(axis="y", visible=False)
-    return ax
-
-
 def _label(candidate: Candidate, end: str) -> str:
     """A hypothesis's name, its two lines parted by `end` or on one."""
     count = len(candidate.effects)
     gap = end or " "
     return candidate.name.replace("+", f" +{gap}") if count < 3 else f"the {count} effects{gap}of the budget"
-
-
-def shrinkage(ax: Axes, found: Diagnosis, channel: str) -> Axes:
-    """Errors of a `channel` in held-out free runs: before, with a black box, after, and the noise floor.
-
-    Raises `InputError` where nothing was held out, or not this channel.
-    """
-    scores = found.shrinkage
-    name = f"rollout_rmse_{channel}"
-    if scores is None or name not in scores.by_metric:
-        raise InputError(f"shrinkage: found none of {channel}, needs a diagnosis that names an effect")
-    own = scores.by_metric[name]
-    bars: Sequence[tuple[str, float, str]] = (
-        ("baseline simulator", own.before, VERMILLION),
-        ("baseline with black box", scores.ceiling[name], GREY),
-        ("with the effect", own.after, BLUE),
-        ("noise floor", own.floor, SKY),
-    )
-    for at, (label, value, colour) in enumerate(bars):
-        ax.bar(at, value, color=colour, width=0.6, label=label)
-    over = "" if own.horizon_s is None else f" in free runs of {own.horizon_s:.3g} s"
-    ax.set_xticks([])
-    ax.set(xlabel=f"held-out blocks{over}", ylabel=f"error of {_NAMES[channel]}")
-    ax.set_ylim(0, None)
-    return ax
 
 
 def _bars_figure(rows: int, narrow: bool) -> Figure:
@@ -284,53 +209,90 @@ def budget_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
 
 @styled
 def road_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
-    """The picture of the gap over time."""
+    """The lines of `stretch_of` over time. Raises `InputError` where there are no traces."""
+    stretch = stretch_of(found)
     figure, (ax,) = panels_of(1, 3.3, narrow=narrow)
-    legend(figure, [gap_on_the_road(ax, found)], narrow=narrow)
+    for (label, values), colour in zip(stretch.lines.items(), (BLACK, VERMILLION, BLUE), strict=False):
+        ax.plot(stretch.time, values, color=colour, lw=1.2 if colour == BLACK else None, label=label)
+    epochs_s = found.log.epochs_s
+    ax.set(xlabel=time_label(epochs_s[0] if len(epochs_s) == 1 else 0.0), ylabel=stretch.axis)
+    ax.margins(x=0)
+    legend(figure, [ax], narrow=narrow)
     return figure
 
 
 @styled
 def where_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
-    """Where the gap lies, along every axis that the log has."""
-    axes: list[Axis] = ["time", "command"]
-    if found.traces is not None and found.traces.speed is not None:
-        axes.insert(1, "speed")
+    """Where the gap lies: along every axis that the log has the shares of `histogram_of`, and the named parts."""
+    axes = axes_of(found)
     figure, panels = panels_of(len(axes), 2.6, narrow=narrow)
     for i, (ax, axis) in enumerate(zip(panels, axes, strict=True)):
-        where_it_lies(ax, found, axis)
-        if i and not narrow:
-            ax.set_ylabel("")
+        shares = histogram_of(found, axis)
+        ax.stairs(shares.rows, shares.edges, fill=True, facecolor="#DDDDDD", edgecolor=GREY, lw=0.8, label="the drive")
+        if shares.effect.any():
+            ax.stairs(shares.effect, shares.edges, color=BLUE, lw=1.6, label="the effect")
+        away = found.log.epochs_s[0] if axis == "time" else 0.0
+        for part in found.where:
+            if part.axis == axis and not isinstance(part.begin, str) and not isinstance(part.end, str):
+                ends = part.begin - away, part.end - away
+                ax.axvspan(*ends, color=ORANGE, alpha=0.18, lw=0, label="named part of the gap")
+        ax.set(xlabel=f"{axis} [{UNITS[axis]}]", ylabel="" if i and not narrow else "share", ylim=(0, None))
+        ax.margins(x=0)
     legend(figure, panels, narrow=narrow)
     return figure
 
 
 @styled
 def which_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
-    """Candidates and their probabilities."""
-    figure = _bars_figure(min(len(found.candidates), 7), narrow)
-    probabilities(figure.add_subplot(), found, narrow=narrow)
+    """A bar for each of the most probable hypotheses, the first at the top; the alias set in blue, the rest in grey."""
+    some = list(found.candidates[:_MOST])[::-1]
+    figure = _bars_figure(len(some), narrow)
+    ax = figure.add_subplot()
+    colours = [BLUE if c.name in found.verdict.alias_set else "#BBBBBB" for c in some]
+    ax.barh(range(len(some)), [c.probability for c in some], color=colours, height=_height(narrow))
+    _name_bars(ax, [_label(c, "" if narrow else "\n") for c in some], narrow=narrow, down=False)
+    for i, c in enumerate(some):
+        ax.text(c.probability + 0.01, i, f"{c.probability:.2f}", va="center", fontsize=9, color=BLACK)
+    ax.set_xticks(_UP_TO_ONE)
+    ax.set(xlabel="probability", xlim=(0, 1.2 if narrow else 1.1))
+    ax.set_ylim(-0.5, len(some) - (0.2 if narrow else 0.5))
+    ax.grid(axis="y", visible=False)
     return figure
 
 
 @styled
 def shrinkage_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
-    """How far the gap shrinks, a panel per channel."""
+    """Errors in held-out free runs, a panel a channel: before, with a black box, after, and the noise floor.
+
+    Raises `InputError` where nothing was held out.
+    """
     scores = found.shrinkage
-    names = [] if scores is None else [w for w in ("accel", "speed") if f"rollout_rmse_{w}" in scores.by_metric]
-    figure, panels = panels_of(len(names), 3.2, narrow=narrow)
-    for ax, channel in zip(panels, names, strict=True):
-        shrinkage(ax, found, channel)
+    if scores is None:
+        raise InputError("shrinkage: found none, needs a diagnosis that names an effect")
+    metrics = {w: m for w in ("accel", "speed") if (m := f"rollout_rmse_{w}") in scores.by_metric}
+    figure, panels = panels_of(len(metrics), 3.2, narrow=narrow)
+    for ax, (channel, metric) in zip(panels, metrics.items(), strict=True):
+        own = scores.by_metric[metric]
+        bars = (
+            ("baseline simulator", own.before, VERMILLION),
+            ("baseline with black box", scores.ceiling[metric], GREY),
+            ("with the effect", own.after, BLUE),
+            ("noise floor", own.floor, SKY),
+        )
+        for at, (label, value, colour) in enumerate(bars):
+            ax.bar(at, value, color=colour, width=0.6, label=label)
+        over = "" if own.horizon_s is None else f" in free runs of {own.horizon_s:.3g} s"
+        ax.set_xticks([])
+        ax.set(xlabel=f"held-out blocks{over}", ylabel=f"error of {LABELS[channel]}", ylim=(0, None))
     legend(figure, panels, narrow=narrow)
     return figure
 
 
-def force_contours(ax: Axes, found: Diagnosis) -> Axes:
+def _force_contours(ax: Axes, found: Diagnosis) -> None:
     """Force beyond K u [m/s²] of the force map over speed and command; hatched, what was not driven: there only its
-    smoothness speaks, and far from the drive it goes back to K u. Raises `InputError` without a force map."""
+    smoothness speaks, and far from the drive it goes back to K u."""
     form = found.free_form
-    if form is None or not form.sizes.table > 0:
-        raise InputError("free_form: the repaired simulator has no force map to draw")
+    assert form is not None
     u, v, table = form.knots_u, form.knots_v, form.at.table
     most = max(float(np.abs(table).max()), 1e-6)
     drawn = ax.contourf(v, u, table, levels=np.linspace(-most, most, 13), cmap="RdBu_r")
@@ -342,18 +304,13 @@ def force_contours(ax: Axes, found: Diagnosis) -> Axes:
     ax.axhline(0.0, color=GREY, lw=0.8)
     ax.set(xlabel="speed [m/s]", ylabel="command [m/s²]", xlim=across[[0, -1]], ylim=along[[0, -1]])
     ax.grid(visible=False)
-    return ax
 
 
-def resistance_line(ax: Axes, found: Diagnosis) -> Axes:
+def _resistance_line(ax: Axes, found: Diagnosis) -> None:
     """The resistance of the free form [m/s²] over speed, and where the middle nine tenths of the drive lie; where
-    nothing was driven it is a line.
-
-    Raises `InputError` without a resistance.
-    """
+    nothing was driven it is a line."""
     form = found.free_form
-    if form is None or not form.sizes.resistance > 0:
-        raise InputError("free_form: the repaired simulator has no resistance to draw")
+    assert form is not None
     ax.plot(form.knots_v, form.at.curve, color=BLUE, marker=".")
     speed = None if found.traces is None else found.traces.speed
     if speed is not None:
@@ -361,7 +318,6 @@ def resistance_line(ax: Axes, found: Diagnosis) -> Axes:
         ax.axvspan(float(low), float(high), color=GREY, alpha=0.15, lw=0)
     ax.axhline(0.0, color=BLACK, lw=0.8)
     ax.set(xlabel="speed [m/s]", ylabel="acceleration [m/s²]")
-    return ax
 
 
 def driven_cells(found: Diagnosis) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -390,7 +346,7 @@ def free_form_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
         raise InputError("free_form: the repaired simulator carries nothing without a name")
     panels = [
         draw
-        for draw, size in ((force_contours, form.sizes.table), (resistance_line, form.sizes.resistance))
+        for draw, size in ((_force_contours, form.sizes.table), (_resistance_line, form.sizes.resistance))
         if size > 0
     ]
     figure, axes = panels_of(len(panels), 3.3, narrow=narrow, wide=4.3 * len(panels))

@@ -5,8 +5,8 @@ Long drives are drawn by envelopes: of each short interval the least and the gre
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -26,6 +26,7 @@ from avtorch.plots.style import (
     BLACK,
     BLUE,
     GREY,
+    LABELS,
     NARROW,
     ORANGE,
     PURPLE,
@@ -48,7 +49,6 @@ _COLOURS = {
     "with what was named": BLUE,
     "repaired simulator": BLUE,
 }
-_LABELS = {"accel": "acceleration [m/s²]", "speed": "speed [m/s]"}
 _BEYOND = 0.3  # of the measured range: how far beyond it a rollout is followed, whose speed may drift without end
 _GROUNDS: dict[Reason, tuple[str, dict[str, Any]]] = {
     "driver": ("driver", {"facecolor": "#DDDDDD"}),
@@ -119,36 +119,23 @@ def envelope(time: FloatArray, values: FloatArray, stretch: IntArray, intervals:
     return np.array(x), np.array(y)
 
 
-@dataclass(frozen=True)
-class DrivePanel:
-    """A panel of the whole drive: what its axis shows, and its lines (row,) by label."""
+def _panels(found: Diagnosis) -> dict[str, dict[str, FloatArray]]:
+    """What was measured and simulated over the whole drive: by the label of a channel's axis its lines (row,) by label.
 
-    label: str
-    lines: Mapping[str, FloatArray] = field(repr=False)
-
-
-def drive_panels(found: Diagnosis) -> list[DrivePanel]:
-    """What was measured and simulated over the whole drive, a panel a channel, the command with the acceleration or in
-    a panel of its own; a simulated speed begins at the measured one every ten seconds (`Traces.begun_anew`).
-
-    Raises `InputError` where there are no traces.
+    The command is with the acceleration or in a panel of its own; a simulated speed begins at the measured one every
+    ten seconds (`Traces.begun_anew`). Raises `InputError` where there are no traces.
     """
     traces = traces_of(found)
-    panels = [] if "accel" in traces.channels else [DrivePanel("command [m/s²]", {"command": traces.command})]
-    for name, measured, before, after in zip(
-        traces.channels,
-        traces.measured,
-        traces.begun_anew(traces.before),
-        traces.begun_anew(traces.after),
-        strict=True,
-    ):
+    panels = {} if "accel" in traces.channels else {"command [m/s²]": {"command": traces.command}}
+    sides = (traces.begun_anew(x) for x in (traces.before, traces.after))
+    for name, measured, before, after in zip(traces.channels, traces.measured, *sides, strict=True):
         lines = {"command": traces.command} if name == "accel" else {}
         lines |= {"measured": measured, "baseline simulator": before}
         if found.free_form is not None:
             lines["repaired simulator"] = after
         elif found.winner.effects:
             lines["with what was named"] = after
-        panels.append(DrivePanel(_LABELS[name], lines))
+        panels[LABELS[name]] = lines
     return panels
 
 
@@ -158,7 +145,7 @@ def drive_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
 
     A simulated speed begins at the measured one every ten seconds. Raises `InputError` where there are no traces.
     """
-    panels = drive_panels(found)
+    panels = _panels(found)
     size = (NARROW if narrow else WIDE, 0.8 + 1.9 * len(panels))
     figure = Figure(figsize=size, layout="constrained")
     _drive(figure, found, panels, narrow=narrow)
@@ -182,7 +169,7 @@ def diagnosis_figure(found: Diagnosis) -> Figure:
     """
     if found.budget is None:
         raise InputError("budget: the diagnosis has none to draw; its drives are too short to hold out blocks")
-    panels = drive_panels(found)
+    panels = _panels(found)
     heights = 0.7 + 0.3 * max(len(found.budget.parts) + 1, 2), 0.8 + 1.6 * len(panels)
     figure = Figure(figsize=(WIDE, sum(heights)), layout="constrained")
     parts = figure.add_gridspec(2, 1, height_ratios=heights)
@@ -192,13 +179,24 @@ def diagnosis_figure(found: Diagnosis) -> Figure:
     return figure
 
 
-def _drive(figure: FigureBase, found: Diagnosis, panels: list[DrivePanel], *, narrow: bool) -> None:
-    axis, traces = drive_time(found), found.traces
-    assert traces is not None
+def _drive(
+    figure: FigureBase, found: Diagnosis, panels: Mapping[str, Mapping[str, FloatArray]], *, narrow: bool
+) -> None:
+    axis, traces = drive_time(found), traces_of(found)
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-    for ax, panel in zip(axes, panels, strict=True):
+    for ax, (name, lines) in zip(axes, panels.items(), strict=True):
         _shade(ax, axis)
-        _channel(ax, axis, traces, panel, _INTERVALS[narrow])
+        for label, values in lines.items():
+            # what was logged does not begin anew with a rollout, and a simulated acceleration does not either
+            anew = name == LABELS["speed"] and label not in ("command", "measured")
+            parts = traces.piece if anew else traces.stretch
+            line = envelope(axis.along, values, parts, _INTERVALS[narrow])
+            ax.plot(*line, color=_COLOURS[label], lw=0.9, label=label)
+        ax.set_ylabel(name)
+        if "measured" in lines:
+            low, high = float(lines["measured"].min()), float(lines["measured"].max())
+            reach = _BEYOND * max(high - low, 1e-3)
+            ax.set_ylim(low - reach, high + reach)
     axes[-1].set(xlabel=axis.label, xlim=(float(axis.along[0]), float(axis.along[-1])))
     legend(figure, axes, narrow=narrow, columns=3)
 
@@ -217,36 +215,17 @@ def _shade(ax: Axes, axis: DriveTime) -> None:
         ax.axvline(axis.onset, color=BLACK, lw=1.0, ls="--", label="onset")
 
 
-def _channel(ax: Axes, axis: DriveTime, traces: Traces, panel: DrivePanel, intervals: int) -> None:
-    for label, values in panel.lines.items():
-        # what was logged does not begin anew with a rollout, and a simulated acceleration does not either
-        anew = panel.label == _LABELS["speed"] and label not in ("command", "measured")
-        parts = traces.piece if anew else traces.stretch
-        ax.plot(*envelope(axis.along, values, parts, intervals), color=_COLOURS[label], lw=0.9, label=label)
-    ax.set_ylabel(panel.label)
-    measured = panel.lines.get("measured")
-    if measured is not None:
-        low, high = float(measured.min()), float(measured.max())
-        reach = _BEYOND * max(high - low, 1e-3)
-        ax.set_ylim(low - reach, high + reach)
-
-
 # single manoeuvres --------------------------------------------------------------------------------------------------
-def manoeuvre_lines(ax: Axes, manoeuvre: Manoeuvre, traces: Traces) -> Axes:
-    """The accelerations of one manoeuvre over time, which is that of its log."""
-    time = traces.time[manoeuvre.rows]
-    for label, values in manoeuvre.lines.items():
-        ax.plot(time, values, color=_COLOURS[label], lw=1.2, label=label)
-    ax.set(xlabel="time [s]", ylabel="acceleration [m/s²]")
-    ax.margins(x=0)
-    return ax
-
-
 @styled
 def manoeuvre_figure(manoeuvre: Manoeuvre, traces: Traces) -> Figure:
-    """One manoeuvre, as wide as a phone or half a desk's page."""
+    """The accelerations of one manoeuvre over its log's time, as wide as a phone or half a desk's page."""
     figure = Figure(figsize=_SMALL, layout="constrained")
-    legend(figure, [manoeuvre_lines(figure.add_subplot(), manoeuvre, traces)], columns=2, fontsize=8)
+    ax = figure.add_subplot()
+    for label, values in manoeuvre.lines.items():
+        ax.plot(traces.time[manoeuvre.rows], values, color=_COLOURS[label], lw=1.2, label=label)
+    ax.set(xlabel="time [s]", ylabel="acceleration [m/s²]")
+    ax.margins(x=0)
+    legend(figure, [ax], columns=2, fontsize=8)
     return figure
 
 
@@ -262,27 +241,20 @@ def sides(found: Diagnosis, left: Residuals) -> Mapping[str, FloatArray]:
     return both if found.winner.effects else {"baseline simulator": left.before}
 
 
-def residuals_against(ax: Axes, found: Diagnosis, axis: Literal["command", "speed"]) -> Axes:
-    """Means of the residual in bins of the command or the speed, with central 90 % intervals by blocks of the drive.
-
-    Raises `InputError` where there are no traces, or no speed.
-    """
-    left = residuals_of(found)
+def _against(ax: Axes, found: Diagnosis, left: Residuals, axis: Literal["command", "speed"]) -> None:
+    """Means of the residual in bins of the command or the speed, with central 90 % intervals by blocks of the drive."""
     along = left.command if axis == "command" else left.speed
-    if along is None:
-        raise InputError("axis: found speed, needs a log in which it was measured")
+    assert along is not None, "a speed that was measured"
     for label, residual in sides(found, left).items():
         bins = left.against(along, residual)
         ax.fill_between(bins.place, bins.low, bins.high, color=_COLOURS[label], alpha=0.2, lw=0)
         ax.plot(bins.place, bins.mean, "o-", color=_COLOURS[label], lw=1.2, ms=3, label=label)
     ax.axhline(0.0, color=BLACK, lw=0.8)
     ax.set(xlabel=f"{axis} [{'m/s²' if axis == 'command' else 'm/s'}]", ylabel="mean residual [m/s²]")
-    return ax
 
 
-def residual_spectrum(ax: Axes, found: Diagnosis) -> Axes:
-    """Power of the residual over frequency, with its central 90 %. Raises `InputError` where there are no traces."""
-    left = residuals_of(found)
+def _spectrum(ax: Axes, found: Diagnosis, left: Residuals) -> None:
+    """Power of the residual over frequency, with its central 90 %."""
     for label, residual in sides(found, left).items():
         spectrum = left.spectrum(residual)
         if spectrum is not None:
@@ -296,15 +268,10 @@ def residual_spectrum(ax: Axes, found: Diagnosis) -> Axes:
     for along in (ax.xaxis, ax.yaxis):
         along.set_minor_locator(NullLocator())
         along.set_major_formatter("{x:g}")
-    return ax
 
 
-def residual_correlation(ax: Axes, found: Diagnosis) -> Axes:
-    """Correlation of the residual with commands before it, and the band of 99 % for one that does not depend on them.
-
-    Raises `InputError` where there are no traces.
-    """
-    left = residuals_of(found)
+def _correlation(ax: Axes, found: Diagnosis, left: Residuals) -> None:
+    """Correlation of the residual with commands before it, and the band of 99 % for one that depends on none."""
     band = 0.0
     for label, residual in sides(found, left).items():
         both = left.correlation(residual)
@@ -314,33 +281,31 @@ def residual_correlation(ax: Axes, found: Diagnosis) -> Axes:
     ax.axhline(0.0, color=BLACK, lw=0.8)
     ax.set(xlabel="time since the command [s]", ylabel="correlation [-]")
     ax.margins(x=0)
-    return ax
-
-
-_DRAW: Mapping[Against, Callable[[Axes, Diagnosis], Axes]] = {
-    "command": lambda ax, found: residuals_against(ax, found, "command"),
-    "speed": lambda ax, found: residuals_against(ax, found, "speed"),
-    "frequency": residual_spectrum,
-    "earlier commands": residual_correlation,
-}
 
 
 @styled
 def residual_figure(found: Diagnosis, against: Against) -> Figure:
-    """One of the drawings above, as wide as a phone or half a desk's page."""
-    figure = Figure(figsize=_SMALL, layout="constrained")
-    legend(figure, [_DRAW[against](figure.add_subplot(), found)], columns=2, fontsize=8)
+    """One of the drawings above, as wide as a phone or half a desk's page.
+
+    Raises `InputError` where there are no traces.
+    """
+    figure, left = Figure(figsize=_SMALL, layout="constrained"), residuals_of(found)
+    ax = figure.add_subplot()
+    if against == "frequency":
+        _spectrum(ax, found, left)
+    elif against == "earlier commands":
+        _correlation(ax, found, left)
+    else:
+        _against(ax, found, left, against)
+    legend(figure, [ax], columns=2, fontsize=8)
     return figure
 
 
 @styled
 def residual_time_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     """The residual over the whole drive, and where 99 % of a steady one with the same quartiles would lie."""
-    left, axis = residuals_of(found), drive_time(found)
-    assert found.traces is not None
-    along = axis.along[
-        np.searchsorted(_rising(found.traces.time, found.traces.stretch), _rising(left.time, left.stretch))
-    ]
+    traces, left, axis = traces_of(found), residuals_of(found), drive_time(found)
+    along = axis.along[np.searchsorted(_rising(traces.time, traces.stretch), _rising(left.time, left.stretch))]
     figure, (ax,) = panels_of(1, 2.6, narrow=narrow)
     usual = 0.0
     for label, residual in sides(found, left).items():

@@ -48,20 +48,6 @@ def peak_gain_of_each(ax: Axes, cars: Sequence[FollowerDiagnosis], *, most: floa
     return ax
 
 
-def amplification(ax: Axes, cars: Sequence[FollowerDiagnosis]) -> Axes:
-    """Spread of each car's speed over its leader's: in the simulated loop, over as measured."""
-    loops = [car.loops[car.law.name] for car in cars]
-    x, y = [e.amplified for e in loops], [e.amplified_simulated for e in loops]
-    low, high = min(*x, *y), max(*x, *y)
-    pad = 0.05 * (high - low) + 0.01
-    ends = (low - pad, high + pad)
-    ax.plot(ends, ends, color=GREY, lw=0.8)
-    ax.plot(x, y, "o", color=BLUE, ms=4)
-    ax.set(xlabel="amplified as measured [-]", ylabel="in the loop driven by the leader [-]", xlim=ends, ylim=ends)
-    ax.set_aspect("equal")
-    return ax
-
-
 @styled
 def followers_figure(cars: Sequence[FollowerDiagnosis]) -> Figure:
     """Headway, lag with delay and peak gain of each car."""

@@ -1,8 +1,8 @@
-"""The paper's experiments, rerun: drawings, and the pictures of `avtorch paper`."""
+"""The paper's experiments, rerun: the pictures of `avtorch paper`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import matplotlib as mpl
@@ -54,100 +54,52 @@ SETTINGS: dict[str, dict[str, Any]] = {
 _LINES = ((BLUE, "o"), (ORANGE, "s"), (PURPLE, "^"), (GREEN, "D"), (VERMILLION, "v"), (SKY, "P"), (BLACK, "X"))
 
 
-def tracked(ax: Axes, truth: ArrayLike, mean: ArrayLike, low: ArrayLike, high: ArrayLike, *, name: str) -> Axes:
+def _lines(ax: Axes, x: ArrayLike, named: Mapping[str, ArrayLike]) -> None:
+    """A marked line each, by label."""
+    for (name, values), (colour, marker) in zip(named.items(), _LINES, strict=False):
+        ax.plot(np.asarray(x), np.asarray(values), color=colour, marker=marker, markersize=4, label=name)
+
+
+def _settings(ax: Axes, x: ArrayLike, named: Mapping[str, ArrayLike]) -> None:
+    """A line each, by names of `SETTINGS`, over the whole axis."""
+    for name, values in named.items():
+        ax.plot(np.asarray(x), np.asarray(values), label=name, **SETTINGS[name])
+    ax.set_xlim(np.asarray(x)[0], np.asarray(x)[-1])
+
+
+def _one(ax: Axes) -> None:
+    ax.axhline(1.0, color=GREY, linewidth=1.0, linestyle=":")
+
+
+def _tracked(ax: Axes, truth: ArrayLike, mean: ArrayLike, low: ArrayLike, high: ArrayLike, *, name: str) -> None:
     """Estimates against the truth (setting,): one mark and one 90 % interval a run (setting, run), and the diagonal.
 
     Runs of one setting stand side by side, a little apart.
     """
     x, m, lo, hi = (np.asarray(v, dtype=float) for v in (truth, mean, low, high))
-    nearest = np.diff(np.unique(x)).min() if len(x) > 1 else x[0]
+    nearest = np.diff(np.unique(x)).min()
     at = x[:, None] + 0.6 * nearest * np.linspace(-0.5, 0.5, m.shape[1])
     ax.plot([x.min(), x.max()], [x.min(), x.max()], color=BLACK, linestyle="--", linewidth=1.0, label="truth", zorder=1)
     ax.vlines(at.ravel(), lo.ravel(), hi.ravel(), color=BLUE, alpha=0.55, linewidth=1.1, label="90 % interval, a run")
     ax.plot(at.ravel(), m.ravel(), ".", color=BLUE, markersize=3, label="mean")
-    ax.set_xlabel(f"true {LABELS[name]}")
-    ax.set_ylabel(f"estimated {short(name)}" + (" [s]" if name == "T_L" else " [-]"))
-    return ax
+    ax.set(xlabel=f"true {LABELS[name]}", ylabel=f"estimated {short(name)} [{_UNITS[name]}]")
 
 
-def error_growth(ax: Axes, x: ArrayLike, errors: Mapping[str, ArrayLike], *, along: str, of: str) -> Axes:
+def _errors(ax: Axes, x: ArrayLike, errors: Mapping[str, ArrayLike], *, along: str, of: str) -> None:
     """Absolute errors (setting, run) over the swept parameter, log-log: median, and the central 90 % of the runs."""
-    x = np.asarray(x, dtype=float)
-    for (name, values), (colour, marker) in zip(errors.items(), _LINES, strict=False):
-        v = np.maximum(np.asarray(values, dtype=float), 1e-9)
-        low, middle, high = np.quantile(v, [0.05, 0.5, 0.95], axis=-1)
+    quantiles = {
+        name: np.quantile(np.maximum(np.asarray(values, dtype=float), 1e-9), [0.05, 0.5, 0.95], axis=-1)
+        for name, values in errors.items()
+    }
+    for (low, _, high), (colour, _) in zip(quantiles.values(), _LINES, strict=False):
         ax.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
-        ax.plot(x, middle, color=colour, marker=marker, markersize=4, label=name)
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    ax.set_xticks(x, [f"{t:g}" for t in x])
+    _lines(ax, x, {name: middle for name, (_, middle, _) in quantiles.items()})
+    ax.set(xscale="log", yscale="log", xlabel=f"true {LABELS[along]}", ylabel=f"error of {short(of)} [{_UNITS[of]}]")
+    ax.set_xticks(x, [f"{t:g}" for t in np.asarray(x)])
     ax.minorticks_off()
-    ax.set_xlabel(f"true {LABELS[along]}")
-    ax.set_ylabel(f"error of {short(of)}" + (" [s]" if of == "T_L" else " [-]"))
-    return ax
 
 
-def setting_traces(ax: Axes, time: ArrayLike, traces: Mapping[str, ArrayLike], *, quantity: str) -> Axes:
-    """Speeds or accelerations (time,) under several settings, named as in `SETTINGS`."""
-    for name, values in traces.items():
-        ax.plot(np.asarray(time), np.asarray(values), label=name, **SETTINGS.get(name, {}))
-    ax.set_ylabel(LABELS[quantity])
-    ax.set_xlim(np.asarray(time)[0], np.asarray(time)[-1])
-    return ax
-
-
-def setting_gains(ax: Axes, omega: ArrayLike, curves: Mapping[str, ArrayLike]) -> Axes:
-    """|G(jω)| (frequency,) of several settings, named as in `SETTINGS`; above one, disturbances grow."""
-    ax.axhline(1.0, color=GREY, linewidth=1.0, linestyle=":")
-    for name, values in curves.items():
-        ax.plot(np.asarray(omega), np.asarray(values), label=name, **SETTINGS.get(name, {}))
-    ax.set_xscale("log")
-    ax.set_xlim(np.asarray(omega)[0], np.asarray(omega)[-1])
-    ax.set_ylim(0.0, None)
-    ax.set_xlabel("frequency ω [rad/s]")
-    return ax
-
-
-def gain_effects(ax: Axes, factors: Sequence[float], measured: Mapping[str, ArrayLike], *, gain: str) -> Axes:
-    """Effect of a gain: measures (factor,) relative to those with the default gain."""
-    for (name, values), (colour, marker) in zip(measured.items(), _LINES, strict=False):
-        v = np.asarray(values, dtype=float)
-        ax.plot(np.asarray(factors), v / v[0], color=colour, marker=marker, markersize=4, label=name)
-    ax.axhline(1.0, color=GREY, linewidth=1.0, linestyle=":")
-    ax.set_xlabel(f"${gain}$, times its default")
-    return ax
-
-
-def platoon_speeds(ax: Axes, time: ArrayLike, leader: ArrayLike, speeds: ArrayLike, *, hit_s: float | None) -> Axes:
-    """Speeds of a platoon (vehicle, time), pale at the head and dark at the tail, behind the leader's (time,).
-
-    `hit_s`: time of the first collision [s]; the time after it is shaded.
-    """
-    time, speeds = np.asarray(time), np.asarray(speeds)
-    shades = mpl.colormaps["viridis_r"](np.linspace(0.1, 0.95, len(speeds)))
-    for i, (speed, colour) in enumerate(zip(speeds, shades, strict=True)):
-        label = f"vehicle {i + 1}" if i in (0, len(speeds) - 1) else None
-        ax.plot(time, speed, color=colour, linewidth=0.9, label=label)
-    ax.plot(time, np.asarray(leader), color=BLACK, linewidth=1.3, linestyle="--", label="leader")
-    if hit_s is not None:
-        ax.axvspan(hit_s, time[-1], color=GREY, alpha=0.2, linewidth=0, label="after a collision")
-    ax.set_xlim(time[0], time[-1])
-    ax.set_ylabel(LABELS["speed"])
-    return ax
-
-
-def amplitude_by_position(ax: Axes, ratios: Mapping[str, ArrayLike]) -> Axes:
-    """RMS over the leader's, by vehicle (vehicle,), one line a setting."""
-    for (name, values), (colour, marker) in zip(ratios.items(), _LINES, strict=False):
-        v = np.asarray(values, dtype=float)
-        ax.plot(np.arange(1, len(v) + 1), v, color=colour, marker=marker, markersize=4, label=name)
-    ax.axhline(1.0, color=GREY, linewidth=1.0, linestyle=":")
-    ax.set_yscale("log")
-    ax.set_xlabel("vehicle behind the leader")
-    return ax
-
-
-# figures -------------------------------------------------------------------------------------------------------------
+_UNITS = {"T_L": "s", "K_L": "-"}
 _FORMS = {
     "print": "as printed",
     "rigorous": "Eqs. 2, 3, rigorous",
@@ -189,14 +141,12 @@ def paper_pictures(found: Mapping[str, Any]) -> dict[str, Callable[[], Figure]]:
         >>> sorted(paper_pictures(reproduce(["gains"], seeds=2).found))
         ['gains.png']
     """
-    pictures: dict[str, Callable[[], Figure]] = {}
-    for name, one in found.items():
-        if name == "strategies":
-            for part, draw in _STRATEGIES.items():
-                pictures[f"strategies_{part}.png"] = lambda one=one, draw=draw: draw(one)
-        else:
-            pictures[f"{name}.png"] = lambda one=one, draw=_DRAWN[name]: draw(one)
-    return pictures
+    return {
+        file: lambda one=found[name], draw=draw: draw(one)
+        for name in found
+        for file, (of, draw) in _DRAWN.items()
+        if of == name
+    }
 
 
 @styled
@@ -231,7 +181,7 @@ def estimation_figure(found: Estimation) -> Figure:
     for i, sweep in enumerate(found.sweeps):
         for j, (name, part) in enumerate((("T_L", slice(0, len(LAGS))), ("K_L", slice(len(LAGS), None)))):
             ax = figure.add_subplot(grid[i, 3 * j : 3 * j + 3])
-            tracked(ax, sweep.truth[part, j], *(x[part, :, j] for x in (sweep.mean, sweep.q05, sweep.q95)), name=name)
+            _tracked(ax, sweep.truth[part, j], *(x[part, :, j] for x in (sweep.mean, sweep.q05, sweep.q95)), name=name)
             if j == 0:
                 ax.set_title(f"Behind {sweep.ahead.name}", fontsize=10)
             first = ax if first is None else first
@@ -240,7 +190,7 @@ def estimation_figure(found: Estimation) -> Figure:
         ax = figure.add_subplot(grid[count, 2 * k : 2 * k + 2])
         column, swept = ("T_L", "K_L").index(of), ("T_L", "K_L").index(along)
         errors = {s.ahead.name: s.error[part, :, column] for s in found.sweeps}
-        error_growth(ax, found.sweeps[0].truth[part, swept], errors, along=along, of=of)
+        _errors(ax, found.sweeps[0].truth[part, swept], errors, along=along, of=of)
         if k == 0:
             ax.legend()
     assert first is not None
@@ -281,7 +231,8 @@ def strategy_figure(found: Strategies, quantity: str) -> Figure:
         events(ax, change_s=CHANGE_S, actions=[{"time_s": ACT_S}])
         traces = {"leader": getattr(base, f"lead_{quantity}")[0], "no action": getattr(base, quantity)[0]}
         traces |= {_KINDS[kind]: getattr(drives[name], quantity)[0] for kind, name in drawn.items()}
-        setting_traces(ax, base.time, traces, quantity=quantity)
+        _settings(ax, base.time, traces)
+        ax.set_ylabel(LABELS[quantity])
         ax.set_title(title)
     axes[-1].set_xlabel("time [s]")
     legend(figure, axes, where="lower center", columns=4)
@@ -296,8 +247,9 @@ def strategy_verdict_figure(found: Strategies) -> Figure:
     omega = torch.logspace(-2, 1.3, 300, dtype=torch.float64)
     for ax, (title, drawn) in zip(axes, _PANELS.items(), strict=True):
         names = {"no action": AS_BUILT, **{_KINDS[kind]: name for kind, name in drawn.items()}}
-        curves = {kind: _gain(omega, found.driven[name]) for kind, name in names.items()}
-        setting_gains(ax, omega, curves)
+        _one(ax)
+        _settings(ax, omega, {kind: _gain(omega, found.driven[name]) for kind, name in names.items()})
+        ax.set(xscale="log", xlabel="frequency ω [rad/s]")
         peaks = "\n".join(f"{float(found.driven[name].peak[0]):.3f}  {kind}" for kind, name in names.items())
         ax.text(0.98, 0.98, peaks, transform=ax.transAxes, ha="right", va="top", fontsize=7)
         ax.set_title(title)
@@ -315,7 +267,9 @@ def gains_figure(found: Gains) -> Figure:
     for i, (ax, name) in enumerate(zip(axes, NAMES, strict=True)):
         measured = {what: middle(values[i]) for what, values in found.measured.items()}
         measured["peak gain, changed vehicle"] = found.peak[i]
-        gain_effects(ax, FACTORS, measured, gain=name)
+        _lines(ax, FACTORS, {what: np.asarray(x) / float(x[0]) for what, x in measured.items()})
+        _one(ax)
+        ax.set_xlabel(f"${name}$, times its default")
     axes[0].set_ylabel("relative to the default [-]")
     axes[0].set_yscale("log")
     axes[0].set_yticks([0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0], ["0.3", "0.5", "0.7", "1", "1.5", "2", "3", "5"])
@@ -337,9 +291,17 @@ def platoon_figure(found: Platoon) -> Figure:
         ax = figure.add_subplot(grid[row, :], sharex=first)
         first = ax if first is None else first
         hit = torch.nonzero((run.spacing[i, 0] <= 0).any(0))
-        hit_s = float(run.time[hit[0, 0]]) if len(hit) else None
         events(ax, change_s=CHANGE_S, actions=[] if i == 0 else [{"time_s": ACT_S}])
-        platoon_speeds(ax, run.time, run.lead_speed[i, 0, 0], run.speed[i, 0], hit_s=hit_s)
+        shades = mpl.colormaps["viridis_r"](np.linspace(0.1, 0.95, len(run.speed[i, 0])))
+        for k, (speed, colour) in enumerate(zip(run.speed[i, 0], shades, strict=True)):
+            label = f"vehicle {k + 1}" if k in (0, len(shades) - 1) else None
+            ax.plot(run.time, speed, color=colour, linewidth=0.9, label=label)
+        ax.plot(run.time, run.lead_speed[i, 0, 0], color=BLACK, linewidth=1.3, linestyle="--", label="leader")
+        if len(hit):
+            hit_s, end_s = float(run.time[hit[0, 0]]), float(run.time[-1])
+            ax.axvspan(hit_s, end_s, color=GREY, alpha=0.2, linewidth=0, label="after a collision")
+        ax.set_xlim(float(run.time[0]), float(run.time[-1]))
+        ax.set_ylabel(LABELS["speed"])
         ax.set_title(f"{found.names[i]}: peak gain {float(found.peak[i]):.3f}", fontsize=10)
         panels.append(ax)
         ax.tick_params(labelbottom=i == platoons[-1])
@@ -347,7 +309,9 @@ def platoon_figure(found: Platoon) -> Figure:
     for column, what in enumerate(("speed", "accel")):
         ax = figure.add_subplot(grid[len(platoons), column])
         ratios = middle(found.against_leader(what, PASSED_S), 1)
-        amplitude_by_position(ax, {name: ratios[i] for i, name in enumerate(found.names)})
+        _lines(ax, np.arange(1, len(ratios[0]) + 1), {name: ratios[i] for i, name in enumerate(found.names)})
+        _one(ax)
+        ax.set(yscale="log", xlabel="vehicle behind the leader")
         word = "speed about its mean" if what == "speed" else "acceleration"
         ax.set_ylabel(f"RMS of the {word}\nover the leader's [-]")
         ax.set_title(f"From {PASSED_S:g} s on", fontsize=10)
@@ -356,30 +320,27 @@ def platoon_figure(found: Platoon) -> Figure:
     return figure
 
 
-_DRAWN: Mapping[str, Callable[[Any], Figure]] = {
-    "regions": regions_figure,
-    "estimation": estimation_figure,
-    "monitoring": monitoring_figure,
-    "gains": gains_figure,
-    "platoon": platoon_figure,
+_DRAWN: Mapping[str, tuple[str, Callable[[Any], Figure]]] = {
+    "regions.png": ("regions", regions_figure),
+    "estimation.png": ("estimation", estimation_figure),
+    "monitoring.png": ("monitoring", monitoring_figure),
+    "gains.png": ("gains", gains_figure),
+    "platoon.png": ("platoon", platoon_figure),
+    "strategies_acceleration.png": ("strategies", lambda one: strategy_figure(one, "accel")),
+    "strategies_speed.png": ("strategies", lambda one: strategy_figure(one, "speed")),
+    "strategies_verdict.png": ("strategies", strategy_verdict_figure),
 }
+"""By file: the experiment, and what draws it."""
 
-_STRATEGIES: Mapping[str, Callable[[Strategies], Figure]] = {
-    "acceleration": lambda one: strategy_figure(one, "accel"),
-    "speed": lambda one: strategy_figure(one, "speed"),
-    "verdict": lambda one: strategy_verdict_figure(one),
-}
-
-
-PAPER_PICTURES = (*(f"{name}.png" for name in _DRAWN), *(f"strategies_{x}.png" for x in _STRATEGIES))
+PAPER_PICTURES = tuple(_DRAWN)
 """Every file that `paper_pictures` may name."""
 
 
-def _windows(one: Watched, scenario: int = 0) -> list[dict[str, Any]]:
+def _windows(one: Watched) -> list[dict[str, Any]]:
     """The first run's windows, as `belief_band` takes them."""
     out = []
-    for w, used in zip(one.run.windows, one.used[:, scenario].tolist(), strict=True):
-        stats = {name: w.window.belief.stat(name, scenario) for name in ("T_L", "K_L")}
+    for w, used in zip(one.run.windows, one.used[:, 0].tolist(), strict=True):
+        stats = {name: w.window.belief.stat(name, 0) for name in ("T_L", "K_L")}
         out.append({"start_s": w.window.start_s, "end_s": w.window.end_s, "used": used, "excited": used, **stats})
     return out
 

@@ -2,41 +2,29 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from avtorch.pedals.pedal_map import PedalMap, unit_of
 from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, styled
 
-if TYPE_CHECKING:
-    from avtorch.pedals import PedalMap
-
 _COLOURS = (VERMILLION, ORANGE, GREEN, BLUE, BLACK)
-_UNITS = {
-    "throttle": (100.0, "%"),
-    "torque": (1.0, "Nm"),
-    "current": (1.0, "A"),
-    "speed_error": (1.0, "m/s"),
-    "speed_cmd_rate": (1.0, "m/s²"),
-}
+_LINES = 4  # speeds
 
 
-def pedal_lines(ax: Axes, made: PedalMap, pedal: str, *, lines: int = 4) -> Axes:
-    """The acceleration that one pedal demands, the others at rest; likewise a commanded speed's error, and its slope.
+def shown_unit(name: str, largest: float) -> tuple[float, str]:
+    """What a pedal's values are multiplied by to be shown, and the unit then; a brake's is by its largest value."""
+    unit = unit_of(name, largest)
+    return {"-": (100.0, "%"), "Pa": (1e-5, "bar")}.get(unit, (1.0, unit.replace("2", "²")))
 
-    Lines are at some speeds between the slowest and the fastest that were driven; bands are one standard error, by
-    blocks of the drive, of what the pedal adds.
-    """
+
+def _lines(ax: Axes, made: PedalMap, pedal: str) -> None:
     table = made.pedals[pedal]
-    if pedal == "brake":
-        scale, unit = (100.0, "%") if float(np.abs(table.pedal).max()) <= 1.2 else (1e-5, "bar")
-    else:
-        scale, unit = _UNITS[pedal]
+    scale, unit = shown_unit(pedal, float(np.abs(table.pedal).max()))
     low, high = made.driven or (made.speed[0], made.speed[-1])
     driven = np.flatnonzero((made.speed >= low) & (made.speed <= high))
-    rows = np.unique(driven[np.linspace(0, len(driven) - 1, lines).round().astype(int)])
+    rows = np.unique(driven[np.linspace(0, len(driven) - 1, _LINES).round().astype(int)])
     for colour, row in zip(_COLOURS, rows, strict=False):
         level = made.coasting[row] + table.accel[:, row]
         ax.plot(scale * table.pedal, level, color=colour, marker=".", label=f"{made.speed[row]:.3g} m/s")
@@ -44,13 +32,16 @@ def pedal_lines(ax: Axes, made: PedalMap, pedal: str, *, lines: int = 4) -> Axes
             error = table.sd[:, row]
             ax.fill_between(scale * table.pedal, level - error, level + error, color=colour, alpha=0.15, linewidth=0)
     ax.axhline(0.0, color=GREY, linestyle=":", linewidth=1)
-    ax.set(xlabel=f"{pedal} [{unit}]", ylabel="acceleration demanded [m/s²]")
-    return ax
+    ax.set(xlabel=f"{pedal} [{unit}]", ylabel="acceleration demanded [m/s²]", title=pedal)
+    ax.legend(loc="best")
 
 
 @styled
 def pedal_figure(made: PedalMap) -> Figure:
-    """A panel for each pedal of a map, side by side.
+    """The acceleration that each pedal demands, the others at rest; likewise a commanded speed's error, and its slope.
+
+    Lines are at some speeds between the slowest and the fastest that were driven; bands are one standard error, by
+    blocks of the drive, of what the pedal adds.
 
     Example:
         >>> import numpy as np
@@ -64,6 +55,5 @@ def pedal_figure(made: PedalMap) -> Figure:
     count = len(made.pedals)
     figure = Figure(figsize=(1.5 + 4.2 * count, 3.8), layout="constrained")
     for ax, pedal in zip(figure.subplots(1, count, squeeze=False)[0], made.pedals, strict=True):
-        pedal_lines(ax, made, pedal).set_title(pedal)
-        ax.legend(loc="best")
+        _lines(ax, made, pedal)
     return figure

@@ -186,8 +186,8 @@ def gain_curve(ax: Axes, omega: ArrayLike, gain: ArrayLike, *, peak: tuple[float
     return ax
 
 
-def verdict_legend(ax: Axes, *, extra: bool = True, beside: Sequence[Axes] = ()) -> Axes:
-    """Name the colours of the verdict map in `ax` and in those `beside` it, and whatever else `ax` labels, below it.
+def verdict_legend(ax: Axes) -> Axes:
+    """Name the colours of the verdict map in `ax`, and whatever else it labels, below it.
 
     Axes without a map have all three named.
 
@@ -197,26 +197,28 @@ def verdict_legend(ax: Axes, *, extra: bool = True, beside: Sequence[Axes] = ())
         >>> [text.get_text() for text in verdict_legend(Figure().subplots()).get_legend().get_texts()]
         ['string stable', 'stable, amplifies (lines: peak gain)', 'unstable']
     """
-    labels = {str(drawn.get_label()) for one in (ax, *beside) for drawn in (*one.collections, *one.patches)}
+    ax.legend(handles=_handles([ax]), loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=8.5)
+    return ax
+
+
+def _handles(axes: Sequence[Axes]) -> list[Any]:
+    """Of a legend: the areas of the maps in all axes, and the points that the first labels."""
+    labels = {str(drawn.get_label()) for ax in axes for drawn in (*ax.collections, *ax.patches)}
     there = {kind for kind, label in enumerate(_VERDICT) if label in labels} or {0, 1, 2}
     names = {
         2: (STABLE, "string stable"),
         1: (AMPLIFIES, "stable, amplifies (lines: peak gain)"),
         0: (UNSTABLE, "unstable"),
     }
-    patches: list[Any] = [
+    handles: list[Any] = [
         Patch(facecolor=colour, edgecolor=GREY, label=name) for kind, (colour, name) in names.items() if kind in there
     ]
-    if extra:
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            if isinstance(handle, Line2D):
-                proxy = Line2D(
-                    [], [], color=handle.get_color(), marker=handle.get_marker(), linestyle="none", label=label
-                )
-                proxy.set_markersize(6 if handle.get_marker() == "x" else 8)
-                patches.append(proxy)
-    ax.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=8.5)
-    return ax
+    for drawn, label in zip(*axes[0].get_legend_handles_labels(), strict=True):
+        if isinstance(drawn, Line2D):
+            # larger and without the cloud's transparency
+            look: Any = {"color": drawn.get_color(), "marker": drawn.get_marker(), "linestyle": "none"}
+            handles.append(Line2D([], [], label=label, markersize=6 if drawn.get_marker() == "x" else 8, **look))
+    return handles
 
 
 # figures -------------------------------------------------------------------------------------------------------------
@@ -257,16 +259,8 @@ def region_figure(
         setting_region(ax, setting, T_range=T_range, K_range=K_range, clouds=clouds, truth=truth, points=points)
         ax.set_title(title)
         ax.label_outer()
-    legend = verdict_legend(axes[0], beside=list(axes[1:])).get_legend()
-    assert legend is not None
-    handles = legend.legend_handles
-    legend.remove()
-    figure.legend(
-        handles=[h for h in handles if h is not None],
-        loc="outside lower center",
-        ncols=1 if narrow else 3,
-        fontsize=8.5,
-    )
+    columns = 1 if narrow else 3
+    figure.legend(handles=_handles(axes), loc="outside lower center", ncols=columns, fontsize=8.5)
     return figure
 
 
@@ -298,7 +292,7 @@ def stability_figure(
     """
     figure = Figure(figsize=(10.4, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[1, 1.05])
-    verdict_legend(region(left, plane, point=point), extra=False)
+    verdict_legend(region(left, plane, point=point))
     gain_curve(right, omega, gain, peak=peak)
     left.set_title("Region")
     right.set_title("Leader's speed to follower's")

@@ -4,18 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from avtorch.gap.quantity import Quantity
-from avtorch.plots.style import BLACK, BLUE, GREY, styled
-
-_WIDE, _NARROW = 8.6, 4.0  # inches
+from avtorch.plots.style import BLACK, BLUE, GREY, NARROW, WIDE, styled
 
 
-def ratio_whiskers(ax: Axes, ratios: Mapping[str, Quantity], *, narrow: bool = False) -> Axes:
-    """A dot and its central 90 % for each of `ratios`, blue where one lies outside; `narrow`: names above them."""
+@styled
+def ratio_figure(ratios: Mapping[str, Quantity], what: str = "ratio", *, narrow: bool = False) -> Figure:
+    """A dot and its central 90 % for each of `ratios`, blue where one lies outside, under the label `what`.
+
+    `narrow`: names above them.
+
+    Example:
+        >>> from avtorch.gap.quantity import Quantity
+        >>> from avtorch.plots import ratio_figure
+        >>> len(ratio_figure({"lag T_L [s]": Quantity(1.5, 0.1, 1.3, 1.7)}, "after / before").axes)
+        1
+    """
+    height = 0.9 + (0.72 if narrow else 0.5) * len(ratios)
+    figure = Figure(figsize=(NARROW if narrow else WIDE, height), layout="constrained")
+    ax = figure.add_subplot()
     for row, q in enumerate(ratios.values()):
         colour = GREY if q.q05 <= 1 <= q.q95 else BLUE
         ax.plot([q.q05, q.q95], [row, row], color=colour, linewidth=2.5)
@@ -46,20 +56,5 @@ def ratio_whiskers(ax: Axes, ratios: Mapping[str, Quantity], *, narrow: bool = F
     ax.xaxis.set_minor_locator(NullLocator())
     ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.3g}"))
     ax.grid(False, axis="y")
-    return ax
-
-
-@styled
-def ratio_figure(ratios: Mapping[str, Quantity], what: str = "ratio", *, narrow: bool = False) -> Figure:
-    """`ratio_whiskers` under the label `what`.
-
-    Example:
-        >>> from avtorch.gap.quantity import Quantity
-        >>> from avtorch.plots import ratio_figure
-        >>> len(ratio_figure({"lag T_L [s]": Quantity(1.5, 0.1, 1.3, 1.7)}, "after / before").axes)
-        1
-    """
-    height = 0.9 + (0.72 if narrow else 0.5) * len(ratios)
-    figure = Figure(figsize=(_NARROW if narrow else _WIDE, height), layout="constrained")
-    ratio_whiskers(figure.add_subplot(), ratios, narrow=narrow).set_xlabel(what)
+    ax.set_xlabel(what)
     return figure

@@ -355,14 +355,26 @@ def _from_start(answer: Mapping[str, Any] | None, epoch_s: float) -> dict[str, A
     return {k: from_start(v, epoch_s) if k in lists and v else v for k, v in (answer or {}).items()}
 
 
-def _events_of(ax: Axes, answer: Mapping[str, Any]) -> Axes:
-    """Mark an answer's events. Of an alarm that continues over many windows, mark only the first and those acted
-    upon."""
-    windows = answer.get("windows") or []
-    went_on = {(b["end_s"], name) for a, b in pairwise(windows) for name in set(a["alerts"]) & set(b["alerts"])}
+def begun(answer: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], int]]:
+    """The alerts that begin or lead to an action, each with the number of windows in which it goes on unanswered."""
+    before = {b["end_s"]: a["end_s"] for a, b in pairwise(answer.get("windows") or ())}
     answered = {a["time_s"] for a in answer.get("actions") or ()}
-    alerts = [
-        a for a in answer.get("alerts") or () if a["time_s"] in answered or (a["time_s"], a["detector"]) not in went_on
-    ]
+    found: list[tuple[Mapping[str, Any], int]] = []
+    last: dict[tuple[str, float], int] = {}  # place among them, by detector and the time of the last unanswered alert
+    for alert in answer.get("alerts") or ():
+        name, time = alert["detector"], alert["time_s"]
+        place = last.get((name, before.get(time, np.nan)))
+        if place is None or time in answered:
+            place = len(found)
+            found.append((alert, 0))
+        else:
+            found[place] = (found[place][0], found[place][1] + 1)
+        if time not in answered:
+            last[name, time] = place
+    return found
+
+
+def _events_of(ax: Axes, answer: Mapping[str, Any]) -> Axes:
+    """Mark an answer's events; of an alarm that goes on over many windows, where it begins and is acted upon."""
     change = (answer.get("change") or {}).get("time_s")
-    return events(ax, change_s=change, alerts=alerts, actions=answer.get("actions") or ())
+    return events(ax, change_s=change, alerts=[a for a, _ in begun(answer)], actions=answer.get("actions") or ())

@@ -42,8 +42,8 @@ def comparison_html(
     return page.html(origin)
 
 
-def comparison_tables(found: Comparison | SimulatorComparison) -> tuple[Table, ...]:
-    """The errors before and after, or of the first and the second; and what has changed or differs, where known."""
+def comparison_tables(found: Comparison | SimulatorComparison) -> tuple[Table, Table]:
+    """The errors before and after, or of the first and the second; and what has changed or differs, as far as known."""
     from avtorch.gap.result.comparison import Comparison
 
     if isinstance(found, Comparison):
@@ -52,8 +52,7 @@ def comparison_tables(found: Comparison | SimulatorComparison) -> tuple[Table, .
             (_row_name(name, found.horizon_s), *map(_told, (m.before, m.after, m.ratio))) for name, m in moved.items()
         ]
         columns = ("quantity", "before (90 %)", "after (90 %)", "after / before (90 %)")
-        table, more = Table("Before and after", columns, tuple(rows), numeric=columns[1:]), _cause_table(found.cause)
-        return (table,) if more is None else (table, more)
+        return Table("Before and after", columns, tuple(rows), numeric=columns[1:]), _cause_table(found.cause)
     errors = found.errors.items()
     rows = [(_row_name(name, found.horizon_s), *map(_told, (e.first, e.second, e.ratio))) for name, e in errors]
     rows.append(("both, geometric mean", "", "", _told(found.ratio)))
@@ -68,18 +67,16 @@ def comparison_tables(found: Comparison | SimulatorComparison) -> tuple[Table, .
         for d in found.differences
     ]
     titles = ("difference", "first", "second", "error of the farther (90 %)")
-    return (table, Table("What the two have differently", titles, tuple(what))) if what else (table,)
+    return table, Table("What the two have differently", titles, tuple(what))
 
 
-def _cause_table(cause: ChangeCause | None) -> Table | None:
+def _cause_table(cause: ChangeCause | None) -> Table:
     """Parts of the change, or the least changes that would show."""
-    if cause is None:
-        return None
-    if not cause.parts:
-        from avtorch.gap.result.comparison import detectable_text
+    from avtorch.gap.result.comparison import detectable_text
 
-        least = tuple((name, detectable_text(name, x)) for name, x in cause.detectable.items())
-        return Table("What would show", ("least change that would show", "size"), least) if least else None
+    if cause is None or not cause.parts:
+        least = () if cause is None else tuple((name, detectable_text(name, x)) for name, x in cause.detectable.items())
+        return Table("What would show", ("least change that would show", "size"), least)
     sides = ("before (90 %)", "after (90 %)", "change (90 %)")
     rows = []
     for part in cause.parts:
@@ -100,7 +97,7 @@ def _of_drives(found: Comparison, notes: Sequence[str]) -> Page:
     said, tone = _OF_SIMULATOR[found.simulator]
     one_drive = found.before == found.after
     car = "The car has changed" if found.changed else "No change of T_L and K_L is detected"
-    table, *more = comparison_tables(found)
+    table, parts = comparison_tables(found)
     ratios = {_row_name(n, found.horizon_s): m.ratio for n, m in {**found.car, **found.gap}.items()}
     none = "An interval that crosses the dashed line cannot be told from no change."
     cause = () if found.cause is None or found.cause.why in found.why else (found.cause.why,)
@@ -113,8 +110,8 @@ def _of_drives(found: Comparison, notes: Sequence[str]) -> Page:
             (_ratios("after / before", ratios, table, none),),
         ),
         (
-            Section("What has changed", cause, tables=tuple(more)),
-            Section("The data", items=tuple(notes)),
+            Section("What has changed", cause, tables=(parts,)),
+            Section("The data", items=notes),
             Section(
                 "Method and limits",
                 items=(
@@ -140,7 +137,7 @@ def _of_simulators(found: SimulatorComparison, notes: Sequence[str]) -> Page:
     if nearer is not None:
         which = found.first if nearer == "first" else found.second
         title = f"The {nearer} simulator is nearer to the car: {which.name}"
-    table, *differences = comparison_tables(found)
+    table, differences = comparison_tables(found)
     ratios = {_row_name(n, found.horizon_s): e.ratio for n, e in found.errors.items()} | {"both": found.ratio}
     equal = (
         "An interval that crosses the dashed line cannot be told from equal errors; right of it the first is nearer."
@@ -151,7 +148,7 @@ def _of_simulators(found: SimulatorComparison, notes: Sequence[str]) -> Page:
         f"{_facts(found.log)}; first: {found.first.name}, second: {found.second.name}",
         Section(title, (found.why,), (_ratios("error of the second / of the first", ratios, table, equal),)),
         (
-            Section("What makes the difference", tables=tuple(differences)),
+            Section("What makes the difference", tables=(differences,)),
             Section("The data", items=(*notes, *remarks)),
             Section(
                 "Method and limits",

@@ -175,24 +175,17 @@ def _rest(found: Diagnosis) -> Section:
 
 
 def _uncertainty(found: Diagnosis) -> Section:
-    columns = found.summary().columns
-    names = list(columns)
-    rows = tuple(
-        (
-            words_of(str(row[0]).rpartition(".")[2]),
-            str(row[0]),
-            *(f"{x:.3g}" for x in row[2:6]),
-            unit_of(str(row[0]).rpartition(".")[2]),
-        )
-        for row in zip(*columns.values(), strict=True)
-    )
+    rows = []
+    for row in found.summary().rows():
+        name = str(row["parameter"]).rpartition(".")[2]
+        numbers = (f"{row[key]:.3g}" for key in ("mean", "sd", "q05", "q95"))
+        rows.append((words_of(name), row["parameter"], *numbers, unit_of(name)))
     says = "Of the repaired simulator" if found.belief else "Of the baseline simulator"
     titles = ("parameter", "name", "mean", "standard deviation", "5 %", "95 %", "unit")
-    assert names[2:6], "the summary has mean, sd and two quantiles"
     return Section(
         "Uncertainty of parameters",
         (f"{says}, given that it has the form found here; that the form is right is under Discrepancies explained.",),
-        tables=(Table("Posterior", titles, rows, numeric=titles[2:6]),) if rows else (),
+        tables=(Table("Posterior", titles, tuple(rows), numeric=titles[2:6]),),
     )
 
 
@@ -212,7 +205,7 @@ def _manoeuvres(found: Diagnosis) -> Section:
         "ISO 19364 compares by bands of tolerance, which it states for steering; none is applied here."
     )
     table = Table("Manoeuvres in which the baseline errs most", columns, tuple(rows), numeric=columns[2:])
-    return Section("Manoeuvres", (said,), tables=(table,)) if rows else Section("Manoeuvres", ("None was recognised.",))
+    return Section("Manoeuvres", (said if rows else "None was recognised.",), tables=(table,))
 
 
 def _band(one: Manoeuvre, name: str) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from avtorch.experiment import Experiment
 from avtorch.gap.result import sentences
-from avtorch.gap.result.budget import UNITS, Axis
+from avtorch.gap.result.budget import UNITS
 from avtorch.gap.result.budget import percent as share_of
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.manoeuvres import Manoeuvre, manoeuvres
@@ -67,49 +67,40 @@ def report_html(
     `quality`: notes from reading the data, one line each. `experiment`: what to drive next, for its picture.
     `sections`: further lines after the verdict, by title. `origin`: how the answer was made, for the footer.
     """
-    log, odd = found.log, found.winner.implausible
+    log, budget, odd = found.log, found.budget, found.winner.implausible
     tones: dict[str, Tone] = {"unknown": "amber", "none": "green"}
-    measures = None if found.shrinkage is None else measure_table(found.shrinkage)
-    curves = _shrinkage(found)
     segments = f"{log.rows} rows in {log.segments} segment{'' if log.segments == 1 else 's'}"
-    places = place_table(found)
-    families = None if found.budget is None else family_table(found.budget)
     page = Page(
         "Diagnosis",
         f"{log.name} · {log.seconds:.0f} s at {log.rate_hz:.3g} Hz",
         Section(
             sentences.headline(found),
             (*_rest(found), *odd, *(() if found.complete else (_PROVISIONAL,))),
-            tuple(p for p in (_budget(found), _free_form(found), _drive(found), _road(found)) if p is not None),
+            (_budget(found), _free_form(found), _drive(found), _road(found)),
         ),
         (
-            Section("In words", tuple(_words(found))),
-            *(Section(title, tuple(lines)) for title, lines in (sections or {}).items()),
+            Section("In words", _words(found)),
+            *(Section(title, lines) for title, lines in (sections or {}).items()),
             Section(
                 "Where the gap lies",
                 tuple(sentences.where(found)) or ("No part of the drive stands out.",),
-                _one(_where(found)),
-                tables=() if places is None else (places,),
+                (_where(found),),
+                tables=(place_table(found),),
                 soft=(*sentences.gap(found), *sentences.moved(found), *sentences.remains(found)),
             ),
-            Section("Which effect", pictures=(_which(found),), tables=() if families is None else (families,)),
+            Section(
+                "Which effect", pictures=(_which(found),), tables=() if budget is None else (family_table(budget),)
+            ),
             _manoeuvres(found),
             residuals(found),
-            Section("How far the gap shrinks")
-            if measures is None or not measures.rows
-            else Section(
-                "How far the gap shrinks",
-                (_held_out(found),),
-                _one(curves),
-                tables=() if curves is not None else (measures,),
-            ),
+            _shrinkage(found),
             _setting(found),
             Section(
                 "What to drive next",
-                tuple(sentences.to_drive(found)),
+                sentences.to_drive(found),
                 () if experiment is None or not sentences.to_drive(found) else (_next(experiment),),
             ),
-            Section("The data", (f"{segments}; signals: {', '.join(log.signals)}.",), items=tuple(quality)),
+            Section("The data", (f"{segments}; signals: {', '.join(log.signals)}.",), items=(*quality,)),
             Section("Method and limits", (_METHOD,), items=(*_LIMITS, *found.notes)),
         ),
         "amber" if odd else tones.get(found.verdict.name, "blue"),
@@ -139,10 +130,6 @@ def write_report(
     """
     text = report_html(found, quality=quality, experiment=experiment, sections=sections, origin=origin)
     return written(text, folder, "report.html")
-
-
-def _one(picture: Picture | None) -> tuple[Picture, ...]:
-    return () if picture is None else (picture,)
 
 
 # the verdict -------------------------------------------------------------------------------------------------------
@@ -336,7 +323,7 @@ def _where(found: Diagnosis) -> Picture | None:
     # where nothing is missing no effect is named whose place could be drawn
     if traces is None or not traces.does.any() or found.verdict.name == "none":
         return None
-    axes: list[Axis] = ["time", "command"] if traces.speed is None else ["time", "speed", "command"]
+    axes = drawings.axes_of(found)
     tables = []
     for axis in axes:
         shares = drawings.histogram_of(found, axis, bins=15)
@@ -370,44 +357,42 @@ def _which(found: Diagnosis) -> Picture:
     )
 
 
-def _shrinkage(found: Diagnosis) -> Picture | None:
-    """Errors over several horizons; of one there is no picture."""
-    scores = found.shrinkage
-    if scores is None or len({metric.horizon_s for metric in scores.by_metric.values()}) < 2:
-        return None
+def _shrinkage(found: Diagnosis) -> Section:
+    """Errors on data held out; over several horizons as a picture."""
+    title, scores = "How far the gap shrinks", found.shrinkage
+    if scores is None or not scores.by_metric:
+        return Section(title)
+    others = "the other drives" if scores.by_drives else "the other folds"
+    how = (
+        f"Cross-validated on {scores.blocks} blocks of the drives: each is scored by a simulator selected and fitted "
+        f"on {others} alone."
+    )
+    measures = measure_table(scores)
+    if len({metric.horizon_s for metric in scores.by_metric.values()}) < 2:
+        return Section(title, (how,), tables=(measures,))
     top = scores.by_metric[scores.metric]
-    return picture_of(
+    drawn = picture_of(
         "shrinkage",
         lambda narrow: drawings.shrinkage_figure(found, narrow=narrow),
         "Bars of the error in held-out rollouts: baseline simulator, baseline with a black box, with the "
         f"effect, noise floor. By the measure that decides, {top.before:.2g} without and {top.after:.2g} with the "
         f"effect, of which {top.floor:.2g} is noise.",
-        measure_table(scores),
+        measures,
         caption="Bold in the table: the measure that decides.",
         opened=True,
     )
-
-
-def _held_out(found: Diagnosis) -> str:
-    scores = found.shrinkage
-    assert scores is not None
-    others = "the other drives" if scores.by_drives else "the other folds"
-    return (
-        f"Cross-validated on {scores.blocks} blocks of the drives: each is scored by a simulator selected and fitted "
-        f"on {others} alone."
-    )
+    return Section(title, (how,), (drawn,))
 
 
 # what to do --------------------------------------------------------------------------------------------------------
 def _setting(found: Diagnosis) -> Section:
-    table = setting_table(found)
-    if found.setting is None or table is None:
+    if found.setting is None:
         return Section("What to set")
     assumed = (
         "Unless another controller was given, this assumes a linear one with a time gap of 1 s and the paper's gains."
     )
     soft = (*found.setting["notes"], assumed)
-    return Section("What to set", (str(found.setting["why"]),), tables=(table,), soft=soft)
+    return Section("What to set", (str(found.setting["why"]),), tables=(setting_table(found.setting),), soft=soft)
 
 
 def _next(experiment: Experiment) -> Picture:

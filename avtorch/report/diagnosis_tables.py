@@ -50,8 +50,8 @@ def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
     return Table("The gap's budget", columns, tuple(rows), numeric=(chance,))
 
 
-def family_table(budget: Budget) -> Table | None:
-    """What acts in each place of the car, whatever its name, and what could act there unseen; None without families."""
+def family_table(budget: Budget) -> Table:
+    """What acts in each place of the car, whatever its name, and what could act there unseen."""
     columns = ("family", "what", "size [m/s²] (90 %)", "takes off the gap (90 %)", "probability", "unseen up to [m/s²]")
     rows = []
     for one in budget.families:
@@ -63,7 +63,7 @@ def family_table(budget: Budget) -> Table | None:
         rows.append((one.family, what, size, off, sentences.number(one.probability), unseen))
     soft = {i for i, one in enumerate(budget.families) if not one.present}
     caption = "The budget by families: each with everything else refitted without it, so that order changes nothing"
-    return Table(caption, columns, tuple(rows), numeric=columns[2:], soft=soft) if rows else None
+    return Table(caption, columns, tuple(rows), numeric=columns[2:], soft=soft)
 
 
 def candidate_table(found: Diagnosis, most: int = 10) -> Table:
@@ -111,11 +111,11 @@ def measure_table(shrinkage: Shrinkage) -> Table:
     return Table("Errors on held-out blocks", columns, tuple(rows), numeric=columns[1:], marked=top)
 
 
-def place_table(found: Diagnosis) -> Table | None:
-    """The parts of the drive in which the gap lies; None where none stands out."""
+def place_table(found: Diagnosis) -> Table:
+    """The parts of the drive in which the gap lies."""
     columns = ("axis", "part", "share of the effect", "q-value")
     rows = tuple(_place(found, part) for part in found.where)
-    return Table("Parts of the drive in which the gap lies", columns, rows, numeric=columns[2:]) if rows else None
+    return Table("Parts of the drive in which the gap lies", columns, rows, numeric=columns[2:])
 
 
 def _place(found: Diagnosis, part: Any) -> tuple[str, str, str, str]:
@@ -129,11 +129,9 @@ def _place(found: Diagnosis, part: Any) -> tuple[str, str, str, str]:
     return part.axis, ends, f"{100 * part.share:.0f} %", "<1e-12" if part.q_value < 1e-12 else f"{part.q_value:.1g}"
 
 
-def setting_table(found: Diagnosis) -> Table | None:
-    """String stability with and without the recommended setting; None where there is none."""
-    if found.setting is None:
-        return None
-    p, peaks = found.setting["p_string_stable"], found.setting["peak_gain"]
+def setting_table(setting: Mapping[str, Any]) -> Table:
+    """String stability with and without the recommended setting."""
+    p, peaks = setting["p_string_stable"], setting["peak_gain"]
     simulators = (("baseline simulator", "assumed"), ("repaired simulator", "in_force"), ("with this setting", "then"))
     columns = ("simulator", "P(string stable)", "peak gain (90 %)")
     rows = tuple((words, f"{p[key]:.2f}", _peak(peaks[key])) for words, key in simulators)

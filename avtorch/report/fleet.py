@@ -58,28 +58,26 @@ def fleet_html(answer: Answer, *, origin: Origin | None = None) -> str:
     if answer.get("schema") != SCHEMA or "population" not in answer:
         raise InputError(f"answer: found {quoted(str(answer.get('schema')))}, needs the object of a fleet.json")
     cars = answer["cars"]
-    failures = failure_table(answer)
     more = sum(len(log["errors"]) for car in cars for log in car["logs"]) - FAILED
-    whose = (cause_table(answer), size_table(answer), population_table(answer))
     reports = ("A car's name leads to the report of its latest diagnosed drive.",) if any(map(report_of, cars)) else ()
     page = Page(
         "Fleet",
-        f"{_many(len(cars), 'car')}, {_many(answer['logs'], 'log')}, {answer['failed_logs']} of them failed",
-        Section(_headline(answer), tuple(_lead(answer))),
+        f"{many(len(cars), 'car')}, {many(answer['logs'], 'log')}, {answer['failed_logs']} of them failed",
+        Section(_headline(answer), _lead(answer)),
         (
             Section(
                 "What is the model's, and what is one car's",
-                tuple(_whose(answer)),
-                _pictures(answer),
-                tables=tuple(table for table in whose if table is not None),
+                _whose(answer),
+                (_picture(answer),),
+                tables=(cause_table(answer), size_table(answer), population_table(answer)),
             ),
             Section("The cars, in the order in which to look at them", reports, more=_ranking(answer)),
             Section(
                 "Logs without an answer",
-                tables=() if failures is None else (failures,),
+                tables=(failure_table(answer),),
                 soft=(f"... and {more} more in fleet.json.",) if more > 0 else (),
             ),
-            Section("Method and limits", items=tuple(_method(answer))),
+            Section("Method and limits", items=_method(answer)),
         ),
         "amber" if answer["reasons"].get("below target") else "green",
         text_of("fleet.js"),
@@ -119,7 +117,7 @@ def _ranking(answer: Answer) -> Markup:
     )
 
 
-def _many(count: int, word: str) -> str:
+def many(count: int, word: str) -> str:
     return f"{count} {word}{'s' if count != 1 else ''}"
 
 
@@ -128,7 +126,7 @@ def _headline(answer: Answer) -> str:
     below, target = answer["reasons"].get("below target", 0), f"P(string stable) of {answer['target']:g}"
     if not known:
         return "No car was estimated"
-    of = f"{known} estimated cars" if known < len(answer["cars"]) else _many(known, "car")
+    of = f"{known} estimated cars" if known < len(answer["cars"]) else many(known, "car")
     if not below:
         return f"No car is below the target, a {target}; {of}"
     return f"{below} of {of} {'is' if below == 1 else 'are'} below the target, a {target}"
@@ -164,7 +162,7 @@ def _whose(answer: Answer) -> list[str]:
         return found
     apart = sum(car["siblings"] is not None and car["siblings"]["q_value"] <= APART for car in answer["cars"])
     found.append(
-        f"{_many(apart, 'car') if apart else 'No car'} of {common['cars']} "
+        f"{many(apart, 'car') if apart else 'No car'} of {common['cars']} "
         f"{'differs' if apart <= 1 else 'differ'} from the others in T_L or K_L by more than cars of this model do."
     )
     for name in ("T_L", "K_L"):
@@ -173,18 +171,18 @@ def _whose(answer: Answer) -> list[str]:
     return found
 
 
-def _pictures(answer: Answer) -> tuple[Picture, ...]:
+def _picture(answer: Answer) -> Picture | None:
     cars = answer["cars"]
     known = [car for car in cars if car["T_L"] is not None and car["K_L"] is not None]
     if not known or any(car["p_string_stable"] is None for car in known):
-        return ()
+        return None
     # draws, and needs matplotlib
     from avtorch.plots.fleet import FEW, fleet_figure
 
     ends = {name: [f(car[name]["mean"] for car in known) for f in (min, max)] for name in ("T_L", "K_L")}
     below = sum(car["p_string_stable"]["now"] < answer["target"] for car in known)
     says = (
-        f"{_many(len(known), 'car')}: T_L {ends['T_L'][0]:.2f} to {ends['T_L'][1]:.2f} s, "
+        f"{many(len(known), 'car')}: T_L {ends['T_L'][0]:.2f} to {ends['T_L'][1]:.2f} s, "
         f"K_L {ends['K_L'][0]:.2f} to {ends['K_L'][1]:.2f}. Beside it the share of cars up to each P(string stable): "
         f"{below} are below the target of {answer['target']:g}."
     )
@@ -195,7 +193,7 @@ def _pictures(answer: Answer) -> tuple[Picture, ...]:
         f"blue: the others{ranks}. Second: the share of cars up to each P(string stable)."
     )
     draw = lambda narrow: fleet_figure(answer, narrow=narrow)  # noqa: E731
-    return (picture_of("fleet", draw, says, stability_table(answer), caption=caption),)
+    return picture_of("fleet", draw, says, stability_table(answer), caption=caption)
 
 
 def _method(answer: Answer) -> list[str]:
@@ -219,7 +217,7 @@ def _method(answer: Answer) -> list[str]:
         spread = " The spread between cars includes that between drives." if common["T_L"]["within"] is None else ""
         found.append(
             "Logarithms of T_L and K_L are partially pooled: drives vary about their car, cars about their model, both "
-            f"normally; the spreads are sampled by SGLD over {_many(common['sampled_cars'], 'car')}.{spread}"
+            f"normally; the spreads are sampled by SGLD over {many(common['sampled_cars'], 'car')}.{spread}"
         )
         found.append(
             "A car is unlike its siblings where its drives lie in the tails of what the other cars alone predict, at "
@@ -286,11 +284,9 @@ def _interval(q: Mapping[str, float], middle: str) -> str:
     return f"{centre} ({low} to {high})"
 
 
-def population_table(answer: Answer) -> Table | None:
-    """What the cars have in common; None where they are too few."""
-    common = answer["population"]
-    if common is None:
-        return None
+def population_table(answer: Answer) -> Table:
+    """What the cars have in common."""
+    common = answer["population"] or {}
     columns = ("quantity", "typical car (90 %)", "cars differ by (90 %)", "drives of a car differ by (90 %)")
     rows = tuple(
         (
@@ -302,6 +298,7 @@ def population_table(answer: Answer) -> Table | None:
             else _percent(common[name]["within"]),
         )
         for name in _UNITS
+        if name in common
     )
     return Table("The model's cars", columns, rows)
 
@@ -311,8 +308,8 @@ def _percent(q: Mapping[str, float]) -> str:
     return f"{middle} % ({low} to {high})"
 
 
-def cause_table(answer: Answer) -> Table | None:
-    """Whose each cause is; None where no diagnosis names one."""
+def cause_table(answer: Answer) -> Table:
+    """Whose each cause is."""
     columns = ("cause", "whose", "cars that have it", "cars that may have it", "share of cars (90 %)", "which cars")
     rows = tuple(
         (
@@ -326,11 +323,11 @@ def cause_table(answer: Answer) -> Table | None:
         for one in answer["causes"]
     )
     marked = {i for i, one in enumerate(answer["causes"]) if one["verdict"] == "the model's"}
-    return Table("Causes over the fleet", columns, rows, marked=marked) if rows else None
+    return Table("Causes over the fleet", columns, rows, marked=marked)
 
 
-def size_table(answer: Answer) -> Table | None:
-    """How large causes are in the cars that have them; None where too few cars tell."""
+def size_table(answer: Answer) -> Table:
+    """How large causes are in the cars that have them, where enough cars tell."""
     columns = ("cause", "parameter", "typical car (90 %)", "nine of ten cars", "cars", "drives")
     rows = tuple(
         (
@@ -344,7 +341,7 @@ def size_table(answer: Answer) -> Table | None:
         for cause in answer["causes"]
         for name, of in cause.get("parameters", {}).items()
     )
-    return Table("How large causes are", columns, rows, numeric=("cars", "drives")) if rows else None
+    return Table("How large causes are", columns, rows, numeric=("cars", "drives"))
 
 
 def _some(cars: Sequence[str], most: int = 5) -> str:
@@ -364,12 +361,12 @@ def stability_table(answer: Answer) -> Table:
     return Table("Cars by P(string stable)", ("P(string stable)", "cars"), tuple(rows), numeric=("cars",))
 
 
-def failure_table(answer: Answer) -> Table | None:
-    """Logs without an answer, the first of them; None where there is none."""
+def failure_table(answer: Answer) -> Table:
+    """Logs without an answer, the first of them."""
     rows = [
         (log["log"], car["car"], step, why or "")
         for car in answer["cars"]
         for log in car["logs"]
         for step, why in log["errors"].items()
     ]
-    return Table("Logs without an answer", ("log", "car", "step", "why"), tuple(rows[:FAILED])) if rows else None
+    return Table("Logs without an answer", ("log", "car", "step", "why"), tuple(rows[:FAILED]))

@@ -11,7 +11,7 @@ import hashlib
 import io
 import platform
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from importlib.resources import files
@@ -128,21 +128,29 @@ class Picture:
 
 @dataclass(frozen=True)
 class Section:
-    """Lines, pictures, `small` pictures side by side, tables, `soft` lines, a list and `more` under a title."""
+    """Lines, pictures, `small` pictures side by side, tables, `soft` lines, a list and `more` under a title.
+
+    None among the pictures and tables without rows are left out.
+    """
 
     title: str
-    lines: tuple[str, ...] = ()
-    pictures: tuple[Picture, ...] = ()
-    small: tuple[Picture, ...] = ()
-    tables: tuple[Table, ...] = ()
-    soft: tuple[str, ...] = ()
-    items: tuple[str, ...] = ()
+    lines: Sequence[str] = ()
+    pictures: Sequence[Picture | None] = ()
+    small: Sequence[Picture] = ()
+    tables: Sequence[Table] = ()
+    soft: Sequence[str] = ()
+    items: Sequence[str] = ()
     more: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pictures", tuple(picture for picture in self.pictures if picture is not None))
+        object.__setattr__(self, "tables", tuple(table for table in self.tables if table.rows))
 
     @property
     def empty(self) -> bool:
         """Whether there is nothing under the title."""
-        return self == Section(self.title)
+        parts = (self.lines, self.pictures, self.small, self.tables, self.soft, self.items, self.more)
+        return not any(map(len, parts))
 
 
 @dataclass(frozen=True)
@@ -153,7 +161,7 @@ class Page:
     kind: str
     of: str
     lead: Section
-    sections: tuple[Section, ...]
+    sections: Sequence[Section]
     tone: Tone = "blue"
     script: str = ""
 
@@ -162,7 +170,7 @@ class Page:
         page = replace(self, sections=tuple(section for section in self.sections if not section.empty))
         script = Markup("\n" + self.script) if self.script else ""
         # thousands of dots are an image within the page
-        pictures = [picture for section in (page.lead, *page.sections) for picture in section.pictures]
+        pictures = [picture for section in (page.lead, *page.sections) for picture in section.pictures if picture]
         policy = "; img-src data:" if any("<image" in picture.wide for picture in pictures) else ""
         policy += f"; script-src 'sha256-{_digest(script)}'" if script else ""
         frame = {"style": Markup(text_of("style.css")), "origin": origin or Origin(), "versions": versions()}

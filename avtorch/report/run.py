@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,14 +12,14 @@ from numpy.typing import ArrayLike
 
 from avtorch.arrays import FloatArray
 from avtorch.plots.plane import loop_of, region_figure
-from avtorch.plots.time import Motion, Steps, motion_figure, overview_figure
+from avtorch.plots.style import LABELS
+from avtorch.plots.time import Motion, Steps, begun, motion_figure, overview_figure
+from avtorch.report.estimates import window_table
 from avtorch.report.page import Origin, Page, Picture, Section, picture_of
 from avtorch.report.table import Table, of_numbers
-from avtorch.report.window_tables import window_table
 from avtorch.results import MEASURES
 from avtorch.vehicle import stability
 
-_QUANTITIES = {"speed": ("speed", "m/s"), "accel": ("acceleration", "m/s²"), "spacing": ("spacing", "m")}
 _STRATEGIES = {
     1: "the lower level",
     2: "the time gap",
@@ -69,12 +68,12 @@ def run_html(
     motion = picture_of(
         "motion",
         lambda narrow: motion_figure(answer, time, traces, narrow=narrow),
-        f"Lines of {', '.join(_QUANTITIES.get(q, (q, ''))[0] for q in traces)} over time: "
+        f"Lines over time of {', '.join(LABELS[quantity] for quantity in traces)}: "
         f"{', '.join(dict.fromkeys(n for q in traces.values() for n in q))}.",
         _motion_table(time, traces),
     )
     story = story_table(answer)
-    more = 1 + len(_begun(answer)) + len(answer["actions"]) - len(story.rows)
+    more = 1 + len(begun(answer)) + len(answer["actions"]) - len(story.rows)
     page = Page(
         "Run",
         f"simulated drive of {answer['windows'][-1]['end_s']:g} s",
@@ -163,8 +162,8 @@ def performance_table(answer: Mapping[str, Any]) -> Table:
 def _motion_table(time: ArrayLike, traces: Motion) -> Table:
     """The lines of the motion at `_ROWS` times at most."""
     lines = {
-        f"{_QUANTITIES.get(q, (q, ''))[0]}, {name} [{_QUANTITIES.get(q, (q, '-'))[1]}]": np.asarray(values)
-        for q, named in traces.items()
+        f"{name}: {LABELS[quantity]}": np.asarray(values)
+        for quantity, named in traces.items()
         for name, values in named.items()
     }
     some = np.column_stack([np.asarray(time), *lines.values()])
@@ -183,7 +182,7 @@ def story_table(answer: Mapping[str, Any], most: int = _MOST) -> Table:
     lines = [
         (change["time_s"], "change", f"the vehicle changes to T_L {change['T_L']:g} s, K_L {change['K_L']:g}"),
     ]
-    for a, more in _begun(answer):
+    for a, more in begun(answer):
         again = f" (and in {more} more window{'s' * (more > 1)})" if more else ""
         lines.append((a["time_s"], "alert", f"{a['detector']}: {a['why']}{again}"))
     for a in answer["actions"]:
@@ -192,26 +191,6 @@ def story_table(answer: Mapping[str, Any], most: int = _MOST) -> Table:
     # the sort is stable: an action stays behind the alert of the same time that it answers
     rows = tuple((f"{time:.1f}", kind, text) for time, kind, text in sorted(lines, key=lambda line: line[0])[:most])
     return Table("Events in order", ("time [s]", "what", "why"), rows)
-
-
-def _begun(answer: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], int]]:
-    """The alerts that begin or lead to an action, each with the number of windows in which it goes on unanswered."""
-    ends = [w["end_s"] for w in answer["windows"]]
-    before = dict(pairwise(ends))
-    answered = {a["time_s"] for a in answer["actions"]}
-    begun: list[tuple[Mapping[str, Any], int]] = []
-    last: dict[tuple[str, float], int] = {}  # place among them, by detector and the time at which it comes next
-    for alert in answer["alerts"]:
-        name, time = alert["detector"], alert["time_s"]
-        place = last.get((name, time))
-        if place is None or time in answered:
-            place = len(begun)
-            begun.append((alert, 0))
-        else:
-            begun[place] = (begun[place][0], begun[place][1] + 1)
-        if time in before and time not in answered:
-            last[name, before[time]] = place
-    return begun
 
 
 def _regions(regions: Regions | None, truth: Mapping[str, Steps] | None) -> tuple[Picture, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import ks_2samp, kstest
 
 from avtorch.inference.arviz_export import shown_unit
-from avtorch.plots.posterior_figures import ChosenWindows, validation_figures
+from avtorch.plots.posteriors import ChosenWindows, validation_figures
 from avtorch.report.page import Origin, Page, Picture, Section, picture_of
 from avtorch.report.table import Table
 from avtorch.results import validation_answer
@@ -162,15 +162,12 @@ def _marginals(chosen: ChosenWindows) -> Table:
 
 def _correlations(chosen: ChosenWindows) -> Table:
     """Of T_L and K_L, by the draws."""
-    found = chosen.validation
-    pair = [found.names.index(name) for name in ("T_L", "K_L")]
-    rows = []
-    for i, window in enumerate(chosen.windows):
-        drawn = [None if chosen.exact is None else chosen.exact.flat[:, i], found.sgld.flat[:, window.number]]
-        drawn.append(None if window.nuts is None else found.nuts.flat[:, window.nuts])
-        told = ("" if x is None else f"{np.corrcoef(x[:, pair].numpy().T)[0, 1]:+.2f}" for x in drawn)
-        rows.append((str(window.number), *told))
+    pair = [chosen.validation.names.index(name) for name in ("T_L", "K_L")]
     columns = ("window", "exact", "SGLD", "NUTS")
+    rows = []
+    for row, window in enumerate(chosen.windows):
+        told = {m: f"{np.corrcoef(x[:, pair].numpy().T)[0, 1]:+.2f}" for m, x in chosen.draws(row).items()}
+        rows.append((str(window.number), *(told.get(method, "") for method in columns[1:])))
     return Table("Correlation of lag and gain", columns, tuple(rows), numeric=columns[1:])
 
 

@@ -50,8 +50,8 @@ def test_an_alarm_that_goes_on_is_one_and_its_time_is_from_the_logs_start(tmp_pa
         (answer(epoch_s=0.0), "begins at 0 s"),
         (answer(schema="avtorch.run/1"), "found 'avtorch.run/1' as its schema"),
         (answer(windows=[{}]), "is damaged"),
-        ([], "found 'None' as its schema"),
-        ("{", "is no JSON"),
+        ([], "is damaged"),
+        ("{", "is damaged"),
     ],
 )
 def test_another_answer_is_one_clear_error(tmp_path: Path, content: object, told: str) -> None:

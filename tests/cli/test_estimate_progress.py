@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from avtorch import GLVDPlant, Leader, estimate, simulate
-from avtorch.cli import talk
 from avtorch.cli.estimate import LINES as NAME
 from avtorch.cli.estimate import finished_windows
-from avtorch.cli.talk import ProgressLines
+from avtorch.display import progress
 from avtorch.errors import InputError
 from avtorch.results import window_entry
 
@@ -53,36 +50,33 @@ def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) -
         estimate(run.log(), estimator="map", finished=write)
 
 
+def lines(title: str, calls: list[tuple], times: list[float], monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What is printed, every 10 s at most, of calls at these times after the beginning."""
+    clock, said = iter([0.0, *times]), []
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
+    step = progress.Steps(title, progress.Lines(said.append), 10.0)
+    for told in calls:
+        step(*told)
+    return said
+
+
 def test_lines_tell_the_share_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = iter([0.0, 4.0, 12.0, 15.0, 25.0])
-    monkeypatch.setattr(talk.time, "monotonic", lambda: next(clock))
-    out = io.StringIO()
-    lines = ProgressLines(Console(file=out), "Estimating")
-    for done in (10, 30, 40, 50):
-        lines(done, 100)
-    assert out.getvalue().splitlines() == [
+    calls = [(done, 100) for done in (10, 30, 40, 50)]
+    assert lines("Estimating", calls, [4.0, 12.0, 15.0, 25.0], monkeypatch) == [
         "Estimating: 30 %, about 28 s left",
         "Estimating: 50 %, about 25 s left",
     ]
 
 
 def test_lines_name_the_stage_where_there_are_several(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = iter([0.0, 20.0])
-    monkeypatch.setattr(talk.time, "monotonic", lambda: next(clock))
-    out = io.StringIO()
-    ProgressLines(Console(file=out), "Diagnosing")(250, 1000, "pairs")
-    assert out.getvalue().splitlines() == ["Diagnosing: 25 %, about 60 s left (pairs)"]
+    said = lines("Diagnosing", [("pairs", 250, 1000)], [20.0], monkeypatch)
+    assert said == ["Diagnosing: 25 %, about 60 s left (pairs)"]
 
 
 def test_what_comes_first_tells_its_own_time_and_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
     """A simulator of 31 s, driven before any step of the diagnosis, made that seem to take half an hour."""
-    clock = iter([0.0, 0.1, 31.0, 51.0])
-    monkeypatch.setattr(talk.time, "monotonic", lambda: next(clock))
-    out = io.StringIO()
-    lines = ProgressLines(Console(file=out), "Diagnosing")
-    for stage, done in (("driving the simulator, about 31 s", 0), ("simulator", 0), ("single effects", 200)):
-        lines(done, 1000, stage)
-    assert out.getvalue().splitlines() == [
+    calls = [("driving the simulator, about 31 s", 0, 1000), ("simulator", 0, 1000), ("single effects", 200, 1000)]
+    assert lines("Diagnosing", calls, [0.1, 31.0, 51.0], monkeypatch) == [
         "Diagnosing: driving the simulator, about 31 s",
         "Diagnosing: 20 %, about 80 s left (single effects)",
     ]

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from avtorch.cli.arguments import limits_pair, positive_pair, three_gains
+from avtorch.cli.arguments import accepted_pair, limits_pair, three_gains
 from avtorch.gap import EFFECTS, GapPlant, plant
 from avtorch.io import Log
 from avtorch.io.mapping import read_mapping
@@ -117,7 +117,7 @@ def test_odd_words_for_a_plant(words: list[str]) -> None:
         assert len(car.effects) <= len(words) or "[" in said or "\n" in said
 
 
-OPTIONS = [three_gains, lambda n, t: positive_pair(n, t, "T_L,K_L", "0.3,1.0"), limits_pair]
+OPTIONS = [three_gains, accepted_pair, limits_pair]
 
 
 PAIRS = st.tuples(st.sampled_from(["speed", "accel", "time", "x"]) | _ODD, NUMBERS).map("=".join)
@@ -131,7 +131,7 @@ PAIRS = st.tuples(st.sampled_from(["speed", "accel", "time", "x"]) | _ODD, NUMBE
     name=st.sampled_from(["map", "unit", "stamp"]),
 )
 def test_odd_options(folder: Path, numbers: str, option: Callable, pairs: list[str], name: str) -> None:
-    values = outcome(lambda: option("--option", numbers))
+    values = outcome(lambda: option(numbers))
     if values is not None:
         assert all(map(math.isfinite, values))
         assert list(values) == [float(x) for x in numbers.split(",")]

@@ -40,11 +40,5 @@ def test_a_loop_that_may_not_be_stable_has_no_peak(cars: list[FollowerDiagnosis]
     assert float(np.asarray(points[0].get_xdata(), float)[0]) == pytest.approx(min(peak.mean, 4.0))
 
 
-def test_amplification_is_that_of_the_loop(cars: list[FollowerDiagnosis]) -> None:
-    ax = over_followers.amplification(Figure().subplots(), cars)
-    own = cars[0].loops["constant_time_gap"]
-    assert np.asarray(ax.lines[1].get_xydata(), float)[0].tolist() == [own.amplified, own.amplified_simulated]
-
-
 def test_figure_has_three_panels(cars: list[FollowerDiagnosis]) -> None:
     assert len(over_followers.followers_figure(cars).axes) == 3

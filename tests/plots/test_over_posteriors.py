@@ -14,6 +14,7 @@ from scipy.stats import gamma
 
 from avtorch import plots
 from avtorch.inference import Posterior, Quadrature
+from avtorch.plots.posteriors import agreement_scatter, exact_density, joint_cloud
 from tests.bars import BAR
 
 NAMES = ("T_L", "K_L", "sigma")
@@ -63,7 +64,7 @@ def steps(ax, label: str) -> StepPatch:
 
 def test_exact_curve_is_the_density() -> None:
     for name, law in zip(NAMES, laws(), strict=True):
-        value, density = plots.exact_density(quadrature(), name)
+        value, density = exact_density(quadrature(), name)
         assert np.allclose(density, law.pdf(value), rtol=0, atol=1e-6 * law.pdf(value).max())
         # the tails left out
         assert np.trapezoid(density, value) == pytest.approx(0.999, abs=1e-4)
@@ -110,7 +111,7 @@ def test_regions_hold_the_share_they_name(rotating_seed: int, draws_factor: int)
         "NUTS": (draws(rotating_seed + 1, count=100), 0),
     }
     own = draws(rotating_seed + 2, count=1000 * draws_factor)
-    assert plots.joint_cloud(ax, own, references=references, truth=(0.3, 1.0)) is ax
+    assert joint_cloud(ax, own, references=references, truth=(0.3, 1.0)) is ax
     inside = [float(word) for word in ax.get_title("left").replace("%", "").split() if word.isdigit()]
     # 4000 draws on either side; half a point for rounding and half for what smoothing does
     for share, found in zip((0.5, 0.9), inside, strict=True):
@@ -122,14 +123,14 @@ def test_a_cloud_that_is_too_wide_is_detected() -> None:
     own = draws(3)
     wide = dataclasses.replace(own, draws=own.mean + 1.5 * (own.draws - own.mean))
     wide = dataclasses.replace(wide, draws=wide.draws.clamp_min(1e-3))
-    ax = plots.joint_cloud(axes(), wide, references={"exact": (draws(4), 0)})
+    ax = joint_cloud(axes(), wide, references={"exact": (draws(4), 0)})
     assert int(ax.get_title("left").split()[2]) < 40
 
 
 def test_scatter_counts_what_is_within_and_shows_what_is_far() -> None:
     value = np.array([0.0, 0.09, -0.11, 0.5, math.nan, -9.0])
     converged = np.array([True, False, True, True, True, True])
-    ax = plots.agreement_scatter(
+    ax = agreement_scatter(
         axes(), np.geomspace(1e-3, 0.5, 6), value, limits=(-0.1, 0.1), error=np.full(6, 0.02), converged=converged
     )
     assert ax.get_title("left") == "33 % within"

@@ -12,7 +12,7 @@ from scipy.stats import kstest
 
 from avtorch import plots
 from avtorch.inference import Posterior, SamplerSettings, integrate
-from avtorch.plots.posterior_figures import ChosenWindows
+from avtorch.plots.posteriors import ChosenWindows
 from avtorch.validation.agreement import AgreementVerdict, agreement, between
 from avtorch.validation.reference import exact_draws
 from avtorch.validation.stein import Stein
