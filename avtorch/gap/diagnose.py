@@ -152,7 +152,7 @@ def diagnose(
     named = names[0] not in ("none", "unknown")
     draws = sample(weight.examined.hypothesis, seed=seed) if named and posterior == "sgld" else None
     chosen = ParameterPosterior(weight, draws, seed, random)
-    candidates, posteriors = candidates_of(average, each, kinds, chosen if named else None, random)
+    candidates, posteriors = candidates_of(average, kinds, chosen if named else None, random)
     # an unknown cause shows where the best known ones would act
     mapped = weight.examined.hypothesis.force is not None
     top = weight if named or mapped or names == ("none",) else _likeliest(average)
@@ -186,7 +186,6 @@ def diagnose(
             average,
             chosen,
             held,
-            each,
             names=names,
             material=material,
             seed=seed,
@@ -224,7 +223,10 @@ def diagnose(
     alike = lookalikes(said.name, data.channels, specific_force=data.accel_kind == "specific-force", among=kinds)
     said = replace(said, alias_set=tuple(dict.fromkeys([*said.alias_set, *sorted(alike)])))
     attribution = row_attribution(rows, best, none)
-    onset = first_onset(weight if named else top, names if named else top.label.split("+"), each)
+    onset = None
+    if names != ("none",):
+        onset = first_onset(weight if named else top, names if named else top.label.split("+"))
+    since = None if onset is None else onset.stamp_s - each[onset.log].epoch_s
     scope = _scope(inference, shown, data.channels, pairs)
     errors = [rows.errors(h) for h in (none, best, repaired.examined.hypothesis)]
     after = errors[2] if named else errors[0]
@@ -242,17 +244,14 @@ def diagnose(
         ),
         candidates=tuple(candidates),
         verdict=said,
-        onset_s=None if onset is None or names == ("none",) else onset.stamp_s,
-        onset_from_start_s=None if onset is None or names == ("none",) else onset.from_start_s,
+        onset_s=None if onset is None else onset.stamp_s,
         onset_log=0 if onset is None else onset.log,
         plant=back,
         simulator=simulator,
         belief=belief,
         assumed=assumed,
         draws=chosen.chains if named else None,
-        where=()
-        if names == ("none",)
-        else localise(attribution, onset_s=None if onset is None else onset.from_start_s, lag=none["T_L"]),
+        where=() if names == ("none",) else localise(attribution, onset_s=since, lag=none["T_L"]),
         shrinkage=shrinkage_of(held, seed) if held is not None and back is not None else None,
         contenders=predictive_models(posteriors, said, base),
         traces=Traces.of(rows, rows.measured - errors[0], rows.measured - after, attribution.does, each),

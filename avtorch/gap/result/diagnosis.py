@@ -68,8 +68,7 @@ class Diagnosis(Displayed, Findings):
 
     - `alarms`: what `avtorch estimate` raised on these drives, where that was given; it is drawn and changes nothing
 
-    The verdict is the budget's where there is one, else the most probable hypothesis. Raises `InputError` where they
-    are inconsistent.
+    The verdict is the budget's where there is one, else the most probable hypothesis.
 
     Example:
         >>> from avtorch import Leader, diagnose, simulate

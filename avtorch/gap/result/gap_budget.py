@@ -46,7 +46,6 @@ from avtorch.gap.result.hypotheses import aliases_of, implausible, onset_of, par
 from avtorch.gap.result.parameters import ParameterPosterior
 from avtorch.gap.result.parts import AnswerPart, map_size
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
-from avtorch.io import Log
 
 CHANCE = ("gust", "outliers", "command_hold")
 """Causes that chance decides: no free run foretells them."""
@@ -103,7 +102,6 @@ def budget_of(
     average: ModelAverage,
     posterior: ParameterPosterior,
     held: HeldOut,
-    logs: Sequence[Log],
     *,
     names: Sequence[str],
     material: float = MATERIAL,
@@ -129,7 +127,7 @@ def budget_of(
             continue
         # a road is in the noise's spectrum: it takes off what the black box knows of the place
         share = shares.get(name, np.zeros(len(draws)))
-        began = onset_of(posterior.weight, name, logs)
+        began = onset_of(posterior.weight, name)
         parts.append(
             Part(
                 name,

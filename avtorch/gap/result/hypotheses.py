@@ -9,21 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-from avtorch.errors import InputError
 from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.coordinates import base_name
-from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.outliers import rate_onset
 from avtorch.gap.quantity import Quantity, of_fields, unit_of
 from avtorch.gap.result.budget import LIKELY
 from avtorch.gap.result.parameters import OwnRandom, ParameterPosterior
 from avtorch.gap.simulator.effect import Effect, candidate_name, delay_effect
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.plant import BASELINE, GapPlant
-from avtorch.io import Log
 
 ALWAYS = ("none", "unknown")
 LEAST_LISTED = 1e-4
@@ -52,12 +48,6 @@ class Candidate:
     onset_s: float | None = None
     implausible: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        if self.name != candidate_name(self.name):
-            raise InputError(f"candidate: found {self.name!r}, needs {candidate_name(self.name)!r}")
-        if not 0 <= self.probability <= 1 + 1e-9:
-            raise InputError(f"{self.name}: found probability {self.probability!r}, needs 0 to 1")
-
     @property
     def effects(self) -> tuple[str, ...]:
         """Its effects: none, one or two."""
@@ -75,18 +65,10 @@ def plausibility(implausible: Sequence[str]) -> dict[str, Any]:
 
 
 def listed_candidates(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
-    """Hypotheses as listed in an answer: improbable ones left out, renormalised to a sum of 1, most probable first.
-
-    Raises `InputError` where `none` or `unknown` is missing, a name occurs twice, or no probability is above 0.
-    """
+    """Hypotheses as listed in an answer: improbable ones left out, renormalised to a sum of 1, most probable first."""
     given = list(candidates)
-    names = [c.name for c in given]
-    if len(set(names)) < len(names) or not set(ALWAYS) <= set(names):
-        raise InputError(f"candidates: found {', '.join(names)}, needs none and unknown and each name once")
     # improbable by their share, so that weights need not be normalised
     total = math.fsum(c.probability for c in given)
-    if not total > 0:
-        raise InputError("candidates: found no probability above 0, needs one")
     kept = [c for c in given if c.name in ALWAYS or c.probability >= LEAST_LISTED * total]
     total = math.fsum(c.probability for c in kept)
     kept.sort(key=lambda c: -c.probability)
@@ -146,51 +128,32 @@ def implausible(
 
     `parameters` of a candidate's `effects`, by their own names or as `effect.parameter`; `moved`: T_L [s] and K_L.
     """
-    sentences = []
-    for effect in effects:
-        for p in (*effect.parameters, *effect.derived):
-            q = parameters.get(f"{effect.name}.{p.name}", parameters.get(p.name))
-            if q is not None and (p.reported or p in effect.derived) and outside(p, q):
-                sentences.append(
-                    f"{_sentence(f'{effect.name}.{p.name}', p, q)}; the effect stands in for something else."
-                )
-    sentences += [
-        f"{_sentence(p.name, p, moved[p.name])}." for p in BASELINE if p.name in moved and outside(p, moved[p.name])
+    each = [
+        (f"{effect.name}.{p.name}", p, parameters.get(f"{effect.name}.{p.name}", parameters.get(p.name)))
+        for effect in effects
+        for p in (*effect.parameters, *effect.derived)
+        if p.reported or p in effect.derived
     ]
-    return tuple(sentences)
+    out = []
+    for name, p, q in (*each, *((p.name, p, moved.get(p.name)) for p in BASELINE)):
+        low, high = p.physical
+        if q is None or (q.q95 >= low and q.q05 <= high):
+            continue
+        unit = unit_of(p.name).replace("-", "")
+        why = p.beyond or f"possible are {low:.2g} to {high:.2g}"
+        end = "; the effect stands in for something else." if "." in name else "."
+        out.append(f"{name} is {f'{q.mean:.2g} {unit}'.strip()}, typical {p.low:.2g} to {p.high:.2g}: {why}{end}")
+    return tuple(out)
 
 
-def outside(parameter: Parameter, q: Quantity) -> bool:
-    """Whether the central 90 % lies entirely outside the possible range."""
-    low, high = parameter.physical
-    return q.q95 < low or q.q05 > high
-
-
-def _sentence(name: str, p: Parameter, q: Quantity) -> str:
-    unit = unit_of(p.name)
-    low, high = p.physical
-    why = p.beyond or f"possible are {low:.2g} to {high:.2g}"
-    return f"{name} is {q.mean:.2g}{'' if unit == '-' else ' ' + unit}, typical {p.low:.2g} to {p.high:.2g}: {why}"
-
-
-@dataclass(frozen=True)
-class Onset:
-    """A time in log number `log`: `stamp_s` on the log's own clock, `from_start_s` from its first row [s]."""
+class Onset(NamedTuple):
+    """A time `stamp_s` [s] on the own clock of log number `log`."""
 
     stamp_s: float
-    from_start_s: float
     log: int
 
-    @classmethod
-    def at(cls, data: DriveData, logs: Sequence[Log], time: float) -> Onset:
-        """The time [s] of the data's own clock."""
-        row = int(abs(data.time - time).argmin())
-        number = int(data.log[row])
-        stamp = float(data.stamp[row] + time - data.time[row])
-        return cls(stamp, stamp - logs[number].epoch_s, number)
 
-
-def onset_of(weight: Weight, name: str, logs: Sequence[Log]) -> Onset | None:
+def onset_of(weight: Weight, name: str) -> Onset | None:
     """Since when a cause of the weight's label acts; None: from the start."""
     h = weight.examined.hypothesis
     time = next((t for e, t in h.onsets.items() if base_name(e) == name), None)
@@ -202,12 +165,15 @@ def onset_of(weight: Weight, name: str, logs: Sequence[Log]) -> Onset | None:
         time = _rate_onset(h, [i for i, _ in h.lost])
     elif name == "outliers" and weight.examined.outliers is not None:
         time = _rate_onset(h, weight.examined.outliers.starts.tolist())
-    return None if time is None else Onset.at(h.data, logs, time)
+    if time is None:
+        return None
+    row = int(abs(h.data.time - time).argmin())
+    return Onset(float(h.data.stamp[row] + time - h.data.time[row]), int(h.data.log[row]))
 
 
-def first_onset(weight: Weight, names: Sequence[str], logs: Sequence[Log]) -> Onset | None:
+def first_onset(weight: Weight, names: Sequence[str]) -> Onset | None:
     """The onset of the first of these causes that has one."""
-    return next((x for x in (onset_of(weight, name, logs) for name in names) if x is not None), None)
+    return next((x for x in (onset_of(weight, name) for name in names) if x is not None), None)
 
 
 def _rate_onset(h: Hypothesis, rows: Sequence[int]) -> float | None:
@@ -265,7 +231,6 @@ def best_weight(average: ModelAverage, names: Sequence[str]) -> Weight:
 
 def candidates_of(
     average: ModelAverage,
-    logs: Sequence[Log],
     kinds: Sequence[type[Effect]],
     posterior: ParameterPosterior | None,
     random: Sequence[OwnRandom] = (),
@@ -279,16 +244,12 @@ def candidates_of(
         if weight is None or label == "unknown":
             out.append(Candidate(label, p))
             continue
-        own = (
-            posterior
-            if posterior is not None and posterior.weight is weight
-            else ParameterPosterior(weight, own=random)
-        )
+        own = posterior if posterior and posterior.weight is weight else ParameterPosterior(weight, own=random)
         posteriors[label] = own
         parameters: dict[str, Quantity] = {} if label == "none" or p < LEAST_LISTED else own.named()
         moved = own.moved()
         odd = implausible(parameters, moved, [k for k in kinds if k.name in label.split("+")])
-        onset = None if label == "none" else first_onset(weight, label.split("+"), logs)
+        onset = None if label == "none" else first_onset(weight, label.split("+"))
         out.append(
             Candidate(
                 label,
