@@ -147,6 +147,7 @@ def diagnose(
     average = renamed(inference.average, random, {kind.name for kind in shown})
     none = inference.base
     rows = CountedRows.of(inference.data, tuple(each))
+    epoch = each[int(rows.log[0])].epoch_s
     names = verdict_names(average)
     weight = best_weight(average, names)
     named = names[0] not in ("none", "unknown")
@@ -204,7 +205,7 @@ def diagnose(
     nameless = ()
     if unnamed is not None:
         change = change_attribution(rows, unnamed.hypothesis, unnamed.change, UNKNOWN_NATS)
-        nameless = localise(change, onset_s=None, lag=none["T_L"])
+        nameless = localise(change, onset_s=None, lag=none["T_L"], epoch_s=epoch)
     parts = parts_of(average, said.names, chosen, seed, unnamed, nameless)
     if budget is not None and held is not None:
         families = families_of(average, chosen, parts, held, free, among=tried_names(shown), seed=seed)
@@ -251,7 +252,7 @@ def diagnose(
         belief=belief,
         assumed=assumed,
         draws=chosen.chains if named else None,
-        where=() if names == ("none",) else localise(attribution, onset_s=since, lag=none["T_L"]),
+        where=() if names == ("none",) else localise(attribution, onset_s=since, lag=none["T_L"], epoch_s=epoch),
         shrinkage=shrinkage_of(held, seed) if held is not None and back is not None else None,
         contenders=predictive_models(posteriors, said, base),
         traces=Traces.of(rows, rows.measured - errors[0], rows.measured - after, attribution.does, each),

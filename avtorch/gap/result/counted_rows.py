@@ -36,18 +36,14 @@ class CountedRows(MeasuredRows):
         log = data.log[at[:, 0]]
         epochs = np.array([each.epoch_s for each in logs])
 
-        def measured(x: FloatArray | None) -> FloatArray | None:
-            return None if x is None else x[at]
-
+        shown = (data.accel if data.raw_accel is None else data.raw_accel, data.speed)
         return cls(
             data=data,
             time=data.stamp[at].mean(1) - epochs[log],
-            stamp=data.stamp[at].mean(1),
             log=log,
             command=data.command[at].mean(1),
-            accel=measured(data.accel if data.raw_accel is None else data.raw_accel),
-            speed=measured(data.speed),
-            source=np.arange(len(at)),
+            channels=data.channels,
+            measured=np.stack([x[at] for x in shown if x is not None]),
             stretch=np.concatenate(stretch),
             dt=group * data.dt,
             group=group,
