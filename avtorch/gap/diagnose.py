@@ -183,17 +183,10 @@ def diagnose(
         moved = {key: q.scaled(ratio[key]) for key, q in moved.items()}
     budget = None
     if held is not None:
+        chance = [kind.name for kind in shown if kind.random]
         budget = budget_of(
-            average,
-            chosen,
-            held,
-            names=names,
-            material=material,
-            seed=seed,
-            chance=[kind.name for kind in shown if kind.random],
+            average, chosen, held, names=names, repaired=moved, chance=chance, material=material, seed=seed
         )
-    if budget is not None:
-        budget = replace(budget, repaired=moved)
         names = budget.verdict
     complete = inference.search.complete
     known = "known effect" if complete and len(kinds) >= len(chosen_effects(None)) else "effect tried"

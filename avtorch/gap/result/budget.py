@@ -329,9 +329,9 @@ def _words(part: Part | ChancePart, behind: str = "") -> str:
     return named_cause(part.name, {key: q.mean for key, q in part.parameters.items()}, behind)
 
 
-def listing(names: Sequence[str]) -> str:
+def listing(names: Sequence[str], last: str = "and") -> str:
     """Names in a sentence."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {last} {names[-1]}"
 
 
 def percent(share: float) -> str:

@@ -14,7 +14,7 @@ size at which that is the cost of an effect's presence is the least that shows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -47,8 +47,6 @@ from avtorch.gap.result.parameters import ParameterPosterior
 from avtorch.gap.result.parts import AnswerPart, map_size
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
-CHANCE = ("gust", "outliers", "command_hold")
-"""Causes that chance decides: no free run foretells them."""
 RESAMPLES = 400
 """Of blocks, with replacement."""
 _NOTHING = 1e-3  # of the energy before, below which free runs show no gap
@@ -104,13 +102,15 @@ def budget_of(
     held: HeldOut,
     *,
     names: Sequence[str],
+    repaired: Mapping[str, Quantity],
+    chance: Collection[str],
     material: float = MATERIAL,
     seed: int = 0,
-    chance: Sequence[str] = (),
 ) -> Budget:
     """The budget of the causes `names` (or `none`, `unknown`); `posterior`: of the weight that has them all.
 
-    `chance`: names of a user's causes that chance decides. `material`: share of the gap from which what is
+    `repaired`: `T_L` [s] and `K_L` [-] of the repaired simulator. `chance`: names of causes that chance decides: no
+    free run foretells them. `material`: share of the gap from which what is
     unexplained is said to matter, where nothing is named by what the evidence says: with `unknown` it does, with
     `none` it does not.
     """
@@ -120,10 +120,9 @@ def budget_of(
     own = posterior.by_effect()
     after = dict(zip(held.names, energy.mean(1)[1:], strict=True))
     bottom = float(floor.mean())
-    by_chance = [name for name in dict.fromkeys((*CHANCE, *chance)) if name in names]
     parts = []
     for name in names:
-        if name in by_chance or name in ("none", "unknown"):
+        if name in chance or name in ("none", "unknown"):
             continue
         # a road is in the noise's spectrum: it takes off what the black box knows of the place
         share = shares.get(name, np.zeros(len(draws)))
@@ -165,7 +164,7 @@ def budget_of(
             carried=None if carried is None else Quantity.of_resampled(carried[0], carried),
         ),
         baseline={key: held.chain[0][key] for key in ("T_L", "K_L")},
-        repaired=posterior.moved(),
+        repaired=repaired,
         chance=tuple(
             ChancePart(
                 name,
@@ -175,8 +174,8 @@ def budget_of(
                 _plausible(name, own),
                 aliases_of(average, name),
             )
-            for name in by_chance
-            if part_probability(average, name) >= LIKELY
+            for name in names
+            if name in chance and part_probability(average, name) >= LIKELY
         ),
         material=material,
         horizon_s=held.horizon_s,
@@ -186,29 +185,27 @@ def budget_of(
 
 def shrinkage_of(held: HeldOut, seed: int = 0) -> Shrinkage:
     """How far the gap shrinks on held-out blocks with all causes, by measure."""
-    blocks, sizes = len(held.blocks.rows), held.blocks.sizes
-    pick = np.random.default_rng(seed).integers(0, blocks, (RESAMPLES, blocks))
     four = (held.steps[0], held.steps[-1], held.floor, held.ceiling)
+    framed = np.flatnonzero(held.frame_rows)  # a block between two frames has no density
+    measures = {f"rollout_rmse_{name}": [x.squares[c] for x in four] for c, name in enumerate(held.data.channels)}
+    measures["log_predictive_density"] = [x.nats[framed] for x in four]
     out: dict[str, MetricShrinkage] = {}
     ceiling: dict[str, float] = {}
-    for c, channel in enumerate(held.data.channels):
-        squares = np.stack([x.squares[c] for x in four])
-        rms = np.sqrt(squares.sum(1) / sizes.sum())
-        drawn = np.sqrt(squares[:, pick].sum(-1) / sizes[pick].sum(-1))
-        name = f"rollout_rmse_{channel}"
-        out[name], ceiling[name] = _metric(rms, drawn, held.horizon_s), float(rms[3])
-    framed = np.flatnonzero(held.frame_rows)  # a block between two frames has no density
-    rows, nats = held.frame_rows[framed], np.stack([x.nats[framed] for x in four])
-    pick = np.random.default_rng(seed).integers(0, len(framed), (RESAMPLES, len(framed)))
-    mean = nats.sum(1) / rows.sum()
-    drawn = nats[:, pick].sum(-1) / rows[pick].sum(-1)
+    for name, each in measures.items():
+        density = name == "log_predictive_density"
+        sums, rows = np.stack(each), held.frame_rows[framed] if density else held.blocks.sizes
+        pick = np.random.default_rng(seed).integers(0, len(rows), (RESAMPLES, len(rows)))
+        levels, drawn = sums.sum(1) / rows.sum(), sums[:, pick].sum(-1) / rows[pick].sum(-1)
+        if not density:
+            levels, drawn = np.sqrt(levels), np.sqrt(drawn)
+        out[name] = _metric(levels, drawn, None if density else held.horizon_s, density=density)
+        ceiling[name] = float(levels[3])
     # the measure in which the gap shows most
-    top = max(out, key=lambda k: out[k].before / max(out[k].floor, 1e-12))
-    if all(x.closed is None for x in out.values()):
+    rollouts = [name for name in measures if name != "log_predictive_density"]
+    top = max(rollouts, key=lambda k: out[k].before / max(out[k].floor, 1e-12))
+    if all(out[name].closed is None for name in rollouts):
         top = "log_predictive_density"
-    out["log_predictive_density"] = _metric(mean, drawn, None, density=True)
-    ceiling["log_predictive_density"] = float(mean[3])
-    return Shrinkage(top, out, ceiling, blocks, held.blocks.by_drives)
+    return Shrinkage(top, out, ceiling, len(held.blocks.rows), held.blocks.by_drives)
 
 
 def families_of(
