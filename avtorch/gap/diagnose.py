@@ -13,6 +13,7 @@ import numpy as np
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.gap.engine.average import ModelAverage, Weight
+from avtorch.gap.engine.car import plant_of
 from avtorch.gap.engine.coordinates import EFFECTS, adopt, base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.evidence import evaluate_evidence
@@ -23,13 +24,12 @@ from avtorch.gap.engine.sample import sample
 from avtorch.gap.result import sentences
 from avtorch.gap.result.attribution import change_attribution, localise, row_attribution
 from avtorch.gap.result.budget import MATERIAL
-from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.result.diagnosis import BlackBoxSimulator, Diagnosis
 from avtorch.gap.result.free_form import fitted_form
-from avtorch.gap.result.free_runs import Blocks
+from avtorch.gap.result.free_runs import CountedRows
 from avtorch.gap.result.gap_budget import budget_of, families_of, shrinkage_of
 from avtorch.gap.result.gap_size import Simulated, gap_size
-from avtorch.gap.result.held_out import held_out_errors, nested
+from avtorch.gap.result.held_out import held_out_errors
 from avtorch.gap.result.hypotheses import (
     ALIAS_RATIO,
     Scope,
@@ -52,14 +52,6 @@ from avtorch.gap.simulator.effect_response import is_observable, lookalikes, not
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import LogSource, as_logs
 from avtorch.io.mapping import Pairs
-
-_FORMS = {
-    (False, False): "a gain that free runs teach",
-    (True, False): "a force map of command and speed",
-    (False, True): "a resistance that depends on the speed",
-    (True, True): "a force map of command and speed and a resistance that depends on the speed",
-}
-_CARRIES = "repaired simulator carries {}, without a name: on blocks left out it foretells more."
 
 
 @shows_progress
@@ -164,16 +156,14 @@ def diagnose(
         told("held-out blocks", 0, 1)
     found = None if named_only else fitted_form(repaired.examined.hypothesis, base, none)
     free = found if found is not None and found.earns_its_place(named=named) else None
-    held = None
-    if Blocks.of(inference.data) is not None:
-        visited = [h for h in inference.search.visited.values() if h.force is None]
-        held = held_out_errors(nested(none, repaired.examined.hypothesis, visited), free)
-        if held is not None and free is not None and not held.free_gains(named=named):
-            free, held = None, held.without_free()
+    visited = [h for h in inference.search.visited.values() if h.force is None]
+    held = held_out_errors(none, repaired.examined.hypothesis, visited, free)
+    if held is not None and free is not None and not held.free_gains(named=named):
+        free, held = None, held.without_free()
     lag_and_gain, assumed = base_quantities(none, seed)
-    bare = _base_weight(inference)
-    simulator = ParameterPosterior(bare).plant(base, bare.process_noise)
-    back = handed_back.plant(base, weight.process_noise) if named else None
+    alone = next(x for x in average.examined if x.hypothesis is none)
+    simulator = plant([], baseline=plant_of(none, base), sigma=alone.compositions[0].slow.process_noise)
+    back = handed_back.plant(base) if named else None
     belief, moved = handed_back.belief() if named else assumed, handed_back.moved()
     if free is not None:
         car = simulator if back is None else back
@@ -191,8 +181,6 @@ def diagnose(
     complete = inference.search.complete
     known = "known effect" if complete and len(kinds) >= len(chosen_effects(None)) else "effect tried"
     said = verdict(average, names, known, partial=budget is not None and budget.partial)
-    if not complete and "unknown" not in said.alias_set:  # which stands for what was not tried
-        said = replace(said, alias_set=(*said.alias_set, "unknown"))
     bearer = average.best.get("unknown", weight) if said.names == ("unknown",) else weight
     unnamed = unnamed_response(average, bearer, inference.search)
     nameless = ()
@@ -204,18 +192,20 @@ def diagnose(
         families = families_of(average, chosen, parts, held, free, among=tried_names(shown), seed=seed)
         rest = replace(budget.unexplained, where=nameless, resembles=_resembles(average, said.names))
         budget = replace(budget, families=families, unexplained=rest if rest.material else budget.unexplained)
-    said = replace(
-        said, why=" ".join(filter(None, (said.why, said_of_unnamed(parts, said.abstained, each[0].epoch_s))))
-    )
     if free is not None:
-        sizes = free.form.sizes
-        carries = _CARRIES.format(_FORMS[sizes.table > 0, sizes.resistance > 0])
-        notes[f"{'Beside its names the' if named else 'The'} {carries}"] = None
+        whose = "Beside its names the" if named else "The"
+        carries = f"{whose} repaired simulator carries {free.form.words}, without a name"
+        notes[f"{carries}: on blocks left out it foretells more."] = None
     if told is not None:
         told("held-out blocks", 1, 1)
     hidden = not_observable(data.channels, kinds)
     alike = lookalikes(said.name, data.channels, specific_force=data.accel_kind == "specific-force", among=kinds)
-    said = replace(said, alias_set=tuple(dict.fromkeys([*said.alias_set, *sorted(alike)])))
+    others = [*([] if complete else ["unknown"]), *sorted(alike)]  # unknown stands for what was not tried
+    said = replace(
+        said,
+        alias_set=tuple(dict.fromkeys([*said.alias_set, *others])),
+        why=f"{said.why} {said_of_unnamed(parts, said.abstained, each[0].epoch_s)}".strip(),
+    )
     attribution = row_attribution(rows, best, none)
     onset = None
     if names != ("none",):
@@ -331,13 +321,6 @@ def _without_map(weight: Weight) -> Weight:
     if h.force is None:
         return weight
     return replace(weight, examined=replace(weight.examined, hypothesis=evaluate_evidence(fit(h.without_map(), 12))))
-
-
-def _base_weight(inference: Inference) -> Weight:
-    """A weight of the base alone."""
-    weight = inference.average.best.get("none") or next(iter(inference.average.best.values()))
-    alone = next(x for x in inference.average.examined if x.hypothesis is inference.base)
-    return replace(weight, label="none", examined=alone, composition=alone.compositions[0], slow="none", outliers=False)
 
 
 def _scope(inference: Inference, kinds: Sequence[type[Effect]], channels: Sequence[str], pairs: bool) -> Scope:

@@ -24,7 +24,7 @@ from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import EFFECT_NATS
 from avtorch.gap.result.budget import Axis, Location
-from avtorch.gap.result.counted_rows import CountedRows
+from avtorch.gap.result.free_runs import CountedRows
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
 _MOST = 0.95  # share of the cause's effect that a part holds

@@ -102,6 +102,13 @@ class FreeForm:
     sizes: Sizes
     T_L: float
 
+    @property
+    def words(self) -> str:
+        """What it is."""
+        table = ["a force map of command and speed"] if self.sizes.table > 0 else []
+        curve = ["a resistance that depends on the speed"] if self.sizes.resistance > 0 else []
+        return " and ".join([*table, *curve]) or "a gain that free runs teach"
+
     def effects(self) -> list[ForceTable | ResistanceCurve]:
         """As effects of a plant."""
         u, v, curve = (tuple(x.round(_DIGITS).tolist()) for x in (self.knots_u, self.knots_v, self.at.curve))

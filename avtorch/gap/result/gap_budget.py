@@ -163,7 +163,6 @@ def budget_of(
             still=_still(held, seed),
             carried=None if carried is None else Quantity.of_resampled(carried[0], carried),
         ),
-        baseline={key: held.chain[0][key] for key in ("T_L", "K_L")},
         repaired=repaired,
         chance=tuple(
             ChancePart(

@@ -16,7 +16,7 @@ from scipy.signal import fftconvolve
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.quantity import plain
-from avtorch.gap.result.counted_rows import CountedRows
+from avtorch.gap.result.free_runs import CountedRows
 from avtorch.gap.rollout_errors import HORIZON_S, reached, rms
 
 WINDOW_S = 10.0
