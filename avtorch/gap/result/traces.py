@@ -90,11 +90,8 @@ class Traces:
     @cached_property
     def piece(self) -> IntArray:
         """Number (row,) of the rollout of at most `HORIZON_S` that a row belongs to; each stretch begins one."""
-        firsts = np.flatnonzero(np.diff(self.stretch, prepend=self.stretch[:1] - 1))
-        since = self.time - self.time[firsts][np.searchsorted(firsts, np.arange(len(self.time)), side="right") - 1]
-        begins = (np.diff(self.stretch, prepend=self.stretch[:1] - 1) != 0) | (
-            np.diff(since // HORIZON_S, prepend=-1.0) > 0
-        )
+        since = np.concatenate([self.time[rows] - self.time[rows[0]] for rows in self.stretches])
+        begins = (np.diff(self.stretch, prepend=-1) != 0) | (np.diff(since // HORIZON_S, prepend=-1.0) > 0)
         return np.cumsum(begins) - 1
 
     def begun_anew(self, simulated: FloatArray) -> FloatArray:
