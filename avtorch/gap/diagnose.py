@@ -37,12 +37,14 @@ from avtorch.gap.result.hypotheses import (
     candidates_of,
     first_onset,
     given_dead_time,
+    parts_of,
+    said_of_unnamed,
+    unnamed_response,
     verdict,
     verdict_names,
 )
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.parameters import ParameterPosterior, base_quantities, own_random, renamed
-from avtorch.gap.result.parts import parts_of, said_of_unnamed, unnamed_response
 from avtorch.gap.result.predictive_model import predictive_models
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.sensor_noise import with_sensor_noise

@@ -13,9 +13,8 @@ from avtorch.gap.result.budget import Budget, Location
 from avtorch.gap.result.free_form import FreeForm
 from avtorch.gap.result.gap_budget import Shrinkage
 from avtorch.gap.result.gap_size import GapSize
-from avtorch.gap.result.hypotheses import Candidate, Scope, Verdict, candidate_name, listed_candidates
+from avtorch.gap.result.hypotheses import AnswerPart, Candidate, Scope, Verdict, candidate_name, listed_candidates
 from avtorch.gap.result.log_facts import LogFacts
-from avtorch.gap.result.parts import AnswerPart
 from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
 from avtorch.gap.result.traces import Alarm, Traces

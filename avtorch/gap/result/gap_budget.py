@@ -42,9 +42,8 @@ from avtorch.gap.result.budget import (
 from avtorch.gap.result.free_form import FittedForm
 from avtorch.gap.result.free_runs import Blocks
 from avtorch.gap.result.held_out import HeldOut
-from avtorch.gap.result.hypotheses import aliases_of, implausible, onset_of, part_probability
+from avtorch.gap.result.hypotheses import AnswerPart, aliases_of, implausible, map_size, onset_of, part_probability
 from avtorch.gap.result.parameters import ParameterPosterior
-from avtorch.gap.result.parts import AnswerPart, map_size
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
 RESAMPLES = 400
