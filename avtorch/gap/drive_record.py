@@ -121,7 +121,7 @@ class Record(MeasuredRows):
             drives=tuple(drives),
             cuts=tuple(cuts),
             time=np.concatenate(columns["time"])[source],
-            log=np.concatenate(columns["log"])[source],
+            log=np.concatenate(columns["log"])[source].astype(np.int64),
             command=np.concatenate(columns["command"])[source],
             channels=channels,
             measured=np.concatenate(columns["measured"], 1)[:, source],

@@ -109,40 +109,38 @@ def budget_of(
     """The budget of the causes `names` (or `none`, `unknown`); `posterior`: of the weight that has them all.
 
     `repaired`: `T_L` [s] and `K_L` [-] of the repaired simulator. `chance`: names of causes that chance decides: no
-    free run foretells them. `material`: share of the gap from which what is
-    unexplained is said to matter, where nothing is named by what the evidence says: with `unknown` it does, with
-    `none` it does not.
+    free run foretells them. `material`: share of the gap from which what is unexplained is said to matter, where
+    nothing is named by what the evidence says: with `unknown` it does, with `none` it does not.
     """
     energy, floor = _energies(held)
     draws = _shares(energy, floor, seed)
     shares = {name: draws[:, k] for k, name in enumerate(held.names)}
-    own = posterior.by_effect()
+    by_effect = posterior.by_effect()
     after = dict(zip(held.names, energy.mean(1)[1:], strict=True))
     bottom = float(floor.mean())
+
+    def about(name: str) -> dict[str, Any]:
+        own = by_effect.get(name, {})
+        return {
+            "name": name,
+            "alias_set": aliases_of(average, name),
+            "probability": part_probability(average, name),
+            "parameters": own,
+            "plausible": not implausible(own, {}, [TABLE[name]] if name in TABLE else []),
+        }
+
     parts = []
     for name in names:
         if name in chance or name in ("none", "unknown"):
             continue
         # a road is in the noise's spectrum: it takes off what the black box knows of the place
         share = shares.get(name, np.zeros(len(draws)))
-        began = onset_of(posterior.weight, name)
-        parts.append(
-            Part(
-                name,
-                aliases_of(average, name),
-                part_probability(average, name),
-                Quantity.of_resampled(share[0], share),
-                float(np.sqrt(after.get(name, energy[-1].mean()) / bottom)),
-                own.get(name, {}),
-                None if began is None else began.stamp_s,
-                _plausible(name, own),
-            )
-        )
+        left, began = float(np.sqrt(after.get(name, energy[-1].mean()) / bottom)), onset_of(posterior.weight, name)
+        onset_s = None if began is None else began.stamp_s
+        parts.append(Part(**about(name), share=Quantity.of_resampled(share[0], share), after=left, onset_s=onset_s))
     parts.sort(key=lambda p: -p.share.mean)
-    named_parts = {p.name for p in parts}
     # with what the hypothesis holds and the label does not name
-    rest = sum((share for name, share in shares.items() if name not in named_parts), draws[:, -1])
-    rest = rest if parts else np.ones(len(draws))
+    rest = np.ones(len(draws)) - sum(shares.get(p.name, 0.0) for p in parts)
     beyond = float((rest > material).mean()) if parts else 0.0
     matters = beyond > 0.95 if parts else tuple(names) == ("unknown",)
     if not parts and names[0] not in ("none", "unknown"):  # chance alone is named, and no part of a simulator is
@@ -150,6 +148,7 @@ def budget_of(
     most = max(sum(p.share.mean for p in parts), 1.0)  # an effect without a name may cost instead of taking off
     parts = [replace(p, share=p.share.scaled(1 / most)) for p in parts]
     carried = shares.get("free form")
+    by_chance = [ChancePart(**about(n), share_of_noise=_share_of_noise(posterior, n)) for n in names if n in chance]
     return Budget(
         before=float(np.sqrt(energy[0].mean() / bottom)),
         left=float(np.sqrt(energy[-1].mean() / bottom)),
@@ -163,18 +162,7 @@ def budget_of(
             carried=None if carried is None else Quantity.of_resampled(carried[0], carried),
         ),
         repaired=repaired,
-        chance=tuple(
-            ChancePart(
-                name,
-                part_probability(average, name),
-                _share_of_noise(posterior, name),
-                own.get(name, {}),
-                _plausible(name, own),
-                aliases_of(average, name),
-            )
-            for name in names
-            if name in chance and part_probability(average, name) >= LIKELY
-        ),
+        chance=tuple(part for part in by_chance if part.probability >= LIKELY),
         material=material,
         horizon_s=held.horizon_s,
         by_drives=held.blocks.by_drives,
@@ -347,10 +335,6 @@ def _metric(levels: FloatArray, drawn: FloatArray, horizon: float | None, *, den
         value = (before - after) / (before - floor)
         closed = Quantity.of_resampled(value, shares)
     return MetricShrinkage(float(before), float(after), float(floor), closed, horizon)
-
-
-def _plausible(name: str, own: Mapping[str, Mapping[str, Quantity]]) -> bool:
-    return not implausible(own.get(name, {}), {}, [TABLE[name]] if name in TABLE else [])
 
 
 def _share_of_noise(posterior: ParameterPosterior, name: str) -> float | None:
