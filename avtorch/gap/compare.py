@@ -15,7 +15,7 @@ The simulator: rollout errors over both sets, and their ratio over bootstrapped 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 
 import numpy as np
@@ -129,19 +129,25 @@ def compare(
         for i, name in enumerate(_CAR)
     }
     simulators = [p if b is not None else one.fitted(plants[0]) for p, b in zip(plants, given, strict=True)]
-    same = all(x is y or _alike(x, y) for x, y in zip(*sides, strict=False)) and len(sides[0]) == len(sides[1])
+    facts = [LogFacts.of(logs) for logs in sides]
+    same = replace(facts[0], name="") == replace(facts[1], name="")
     horizon = _horizon(fitted)
     gap = _gaps(fitted, simulators, horizon, same=same)
     simulator = _simulator_change(gap)
     changed = p_value < level
     cause, of_two = None, None
-    model = None if same else _joint(sides, plants[0], told)
+    if told is not None:
+        told("one model of both drives", 1, 2)
+    try:
+        model = None if same else JointModel.of(DriveData.of([*sides[0], *sides[1]]), len(sides[0]), plants[0])
+    except InputError:  # long enough for lag and gain, too short for a cause
+        model = None
     if model is not None:
         cause = cause_of_change(model, kinds, progress=told)
         of_two = dead_time_test(model) if changed else None
     return Comparison(
-        before=LogFacts.of(sides[0]),
-        after=LogFacts.of(sides[1]),
+        before=facts[0],
+        after=facts[1],
         car=car,
         gap=gap,
         p_value=p_value,
@@ -235,24 +241,6 @@ def _by_rows(record: Record, base: GapPlant, blocks: Sequence[slice]) -> tuple[F
     return z, information, np.stack([scores[:, b].sum(1) for b in blocks], 1)
 
 
-def _joint(
-    sides: Sequence[Sequence[Log]], base: GapPlant, told: Callable[[str, int, int], None] | None
-) -> JointModel | None:
-    """None where the drives, long enough for lag and gain, are too short for a cause."""
-    if told is not None:
-        told("one model of both drives", 1, 2)
-    try:
-        return JointModel.of(DriveData.of([*sides[0], *sides[1]]), len(sides[0]), base)
-    except InputError:
-        return None
-
-
-def _alike(one: Log, two: Log) -> bool:
-    """Whether both logs hold the same rows."""
-    signals = ((getattr(x, name) for x in (one, two)) for name in ("time", "accel_cmd", "accel", "speed", "usable"))
-    return all(a is b if a is None or b is None else np.array_equal(a, b) for a, b in signals)
-
-
 def _horizon(sides: Sequence[_LagAndGain]) -> float:
     """Length of the rollouts [s], up to `HORIZON_S`, that fits the stretches of both sides: errors grow with it.
 
@@ -304,11 +292,11 @@ def _gaps(
 
 
 def _simulator_change(gap: Mapping[str, Change]) -> SimulatorChange:
-    ratios = [moved.ratio for moved in gap.values()]
-    closer, farther = (any(r.q95 < 1 for r in ratios), any(r.q05 > 1 for r in ratios))
-    if closer == farther:
-        return "inconclusive"
-    return "closer" if closer else "farther"
+    closer, farther = (
+        any(moved.ratio.q95 < 1 for moved in gap.values()),
+        any(moved.ratio.q05 > 1 for moved in gap.values()),
+    )
+    return "inconclusive" if closer == farther else "closer" if closer else "farther"
 
 
 def _sentence(

@@ -13,6 +13,7 @@ import numpy as np
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.gap.engine.average import ModelAverage, Weight
+from avtorch.gap.engine.car import plant_of
 from avtorch.gap.engine.coordinates import EFFECTS, adopt, base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.evidence import evaluate_evidence
@@ -23,13 +24,12 @@ from avtorch.gap.engine.sample import sample
 from avtorch.gap.result import sentences
 from avtorch.gap.result.attribution import change_attribution, localise, row_attribution
 from avtorch.gap.result.budget import MATERIAL
-from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.result.diagnosis import BlackBoxSimulator, Diagnosis
 from avtorch.gap.result.free_form import fitted_form
-from avtorch.gap.result.free_runs import Blocks
+from avtorch.gap.result.free_runs import CountedRows
 from avtorch.gap.result.gap_budget import budget_of, families_of, shrinkage_of
 from avtorch.gap.result.gap_size import Simulated, gap_size
-from avtorch.gap.result.held_out import held_out_errors, nested
+from avtorch.gap.result.held_out import held_out_errors
 from avtorch.gap.result.hypotheses import (
     ALIAS_RATIO,
     Scope,
@@ -37,12 +37,14 @@ from avtorch.gap.result.hypotheses import (
     candidates_of,
     first_onset,
     given_dead_time,
+    parts_of,
+    said_of_unnamed,
+    unnamed_response,
     verdict,
     verdict_names,
 )
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.parameters import ParameterPosterior, base_quantities, own_random, renamed
-from avtorch.gap.result.parts import parts_of, said_of_unnamed, unnamed_response
 from avtorch.gap.result.predictive_model import predictive_models
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.sensor_noise import with_sensor_noise
@@ -52,14 +54,6 @@ from avtorch.gap.simulator.effect_response import is_observable, lookalikes, not
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import LogSource, as_logs
 from avtorch.io.mapping import Pairs
-
-_FORMS = {
-    (False, False): "a gain that free runs teach",
-    (True, False): "a force map of command and speed",
-    (False, True): "a resistance that depends on the speed",
-    (True, True): "a force map of command and speed and a resistance that depends on the speed",
-}
-_CARRIES = "repaired simulator carries {}, without a name: on blocks left out it foretells more."
 
 
 @shows_progress
@@ -147,12 +141,13 @@ def diagnose(
     average = renamed(inference.average, random, {kind.name for kind in shown})
     none = inference.base
     rows = CountedRows.of(inference.data, tuple(each))
+    epoch = each[int(rows.log[0])].epoch_s
     names = verdict_names(average)
     weight = best_weight(average, names)
     named = names[0] not in ("none", "unknown")
     draws = sample(weight.examined.hypothesis, seed=seed) if named and posterior == "sgld" else None
     chosen = ParameterPosterior(weight, draws, seed, random)
-    candidates, posteriors = candidates_of(average, each, kinds, chosen if named else None, random)
+    candidates, posteriors = candidates_of(average, kinds, chosen if named else None, random)
     # an unknown cause shows where the best known ones would act
     mapped = weight.examined.hypothesis.force is not None
     top = weight if named or mapped or names == ("none",) else _likeliest(average)
@@ -163,16 +158,14 @@ def diagnose(
         told("held-out blocks", 0, 1)
     found = None if named_only else fitted_form(repaired.examined.hypothesis, base, none)
     free = found if found is not None and found.earns_its_place(named=named) else None
-    held = None
-    if Blocks.of(inference.data) is not None:
-        visited = [h for h in inference.search.visited.values() if h.force is None]
-        held = held_out_errors(nested(none, repaired.examined.hypothesis, visited), free)
-        if held is not None and free is not None and not held.free_gains(named=named):
-            free, held = None, held.without_free()
+    visited = [h for h in inference.search.visited.values() if h.force is None]
+    held = held_out_errors(none, repaired.examined.hypothesis, visited, free)
+    if held is not None and free is not None and not held.free_gains(named=named):
+        free, held = None, held.without_free()
     lag_and_gain, assumed = base_quantities(none, seed)
-    bare = _base_weight(inference)
-    simulator = ParameterPosterior(bare).plant(base, bare.process_noise)
-    back = handed_back.plant(base, weight.process_noise) if named else None
+    alone = next(x for x in average.examined if x.hypothesis is none)
+    simulator = plant([], baseline=plant_of(none, base), sigma=alone.compositions[0].slow.process_noise)
+    back = handed_back.plant(base) if named else None
     belief, moved = handed_back.belief() if named else assumed, handed_back.moved()
     if free is not None:
         car = simulator if back is None else back
@@ -182,49 +175,44 @@ def diagnose(
         moved = {key: q.scaled(ratio[key]) for key, q in moved.items()}
     budget = None
     if held is not None:
+        chance = [kind.name for kind in shown if kind.random]
         budget = budget_of(
-            average,
-            chosen,
-            held,
-            each,
-            names=names,
-            material=material,
-            seed=seed,
-            chance=[kind.name for kind in shown if kind.random],
+            average, chosen, held, names=names, repaired=moved, chance=chance, material=material, seed=seed
         )
-    if budget is not None:
-        budget = replace(budget, repaired=moved)
         names = budget.verdict
     complete = inference.search.complete
     known = "known effect" if complete and len(kinds) >= len(chosen_effects(None)) else "effect tried"
     said = verdict(average, names, known, partial=budget is not None and budget.partial)
-    if not complete and "unknown" not in said.alias_set:  # which stands for what was not tried
-        said = replace(said, alias_set=(*said.alias_set, "unknown"))
     bearer = average.best.get("unknown", weight) if said.names == ("unknown",) else weight
     unnamed = unnamed_response(average, bearer, inference.search)
     nameless = ()
     if unnamed is not None:
         change = change_attribution(rows, unnamed.hypothesis, unnamed.change, UNKNOWN_NATS)
-        nameless = localise(change, onset_s=None, lag=none["T_L"])
+        nameless = localise(change, onset_s=None, lag=none["T_L"], epoch_s=epoch)
     parts = parts_of(average, said.names, chosen, seed, unnamed, nameless)
     if budget is not None and held is not None:
         families = families_of(average, chosen, parts, held, free, among=tried_names(shown), seed=seed)
         rest = replace(budget.unexplained, where=nameless, resembles=_resembles(average, said.names))
         budget = replace(budget, families=families, unexplained=rest if rest.material else budget.unexplained)
-    said = replace(
-        said, why=" ".join(filter(None, (said.why, said_of_unnamed(parts, said.abstained, each[0].epoch_s))))
-    )
     if free is not None:
-        sizes = free.form.sizes
-        carries = _CARRIES.format(_FORMS[sizes.table > 0, sizes.resistance > 0])
-        notes[f"{'Beside its names the' if named else 'The'} {carries}"] = None
+        whose = "Beside its names the" if named else "The"
+        carries = f"{whose} repaired simulator carries {free.form.words}, without a name"
+        notes[f"{carries}: on blocks left out it foretells more."] = None
     if told is not None:
         told("held-out blocks", 1, 1)
     hidden = not_observable(data.channels, kinds)
     alike = lookalikes(said.name, data.channels, specific_force=data.accel_kind == "specific-force", among=kinds)
-    said = replace(said, alias_set=tuple(dict.fromkeys([*said.alias_set, *sorted(alike)])))
+    others = [*([] if complete else ["unknown"]), *sorted(alike)]  # unknown stands for what was not tried
+    said = replace(
+        said,
+        alias_set=tuple(dict.fromkeys([*said.alias_set, *others])),
+        why=f"{said.why} {said_of_unnamed(parts, said.abstained, each[0].epoch_s)}".strip(),
+    )
     attribution = row_attribution(rows, best, none)
-    onset = first_onset(weight if named else top, names if named else top.label.split("+"), each)
+    onset = None
+    if names != ("none",):
+        onset = first_onset(weight if named else top, names if named else top.label.split("+"))
+    since = None if onset is None else onset.stamp_s - each[onset.log].epoch_s
     scope = _scope(inference, shown, data.channels, pairs)
     errors = [rows.errors(h) for h in (none, best, repaired.examined.hypothesis)]
     after = errors[2] if named else errors[0]
@@ -242,17 +230,14 @@ def diagnose(
         ),
         candidates=tuple(candidates),
         verdict=said,
-        onset_s=None if onset is None or names == ("none",) else onset.stamp_s,
-        onset_from_start_s=None if onset is None or names == ("none",) else onset.from_start_s,
+        onset_s=None if onset is None else onset.stamp_s,
         onset_log=0 if onset is None else onset.log,
         plant=back,
         simulator=simulator,
         belief=belief,
         assumed=assumed,
         draws=chosen.chains if named else None,
-        where=()
-        if names == ("none",)
-        else localise(attribution, onset_s=None if onset is None else onset.from_start_s, lag=none["T_L"]),
+        where=() if names == ("none",) else localise(attribution, onset_s=since, lag=none["T_L"], epoch_s=epoch),
         shrinkage=shrinkage_of(held, seed) if held is not None and back is not None else None,
         contenders=predictive_models(posteriors, said, base),
         traces=Traces.of(rows, rows.measured - errors[0], rows.measured - after, attribution.does, each),
@@ -338,13 +323,6 @@ def _without_map(weight: Weight) -> Weight:
     if h.force is None:
         return weight
     return replace(weight, examined=replace(weight.examined, hypothesis=evaluate_evidence(fit(h.without_map(), 12))))
-
-
-def _base_weight(inference: Inference) -> Weight:
-    """A weight of the base alone."""
-    weight = inference.average.best.get("none") or next(iter(inference.average.best.values()))
-    alone = next(x for x in inference.average.examined if x.hypothesis is inference.base)
-    return replace(weight, label="none", examined=alone, composition=alone.compositions[0], slow="none", outliers=False)
 
 
 def _scope(inference: Inference, kinds: Sequence[type[Effect]], channels: Sequence[str], pairs: bool) -> Scope:

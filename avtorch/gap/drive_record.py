@@ -13,12 +13,12 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from avtorch.arrays import Float, FloatArray, Int, IntArray
@@ -42,30 +42,26 @@ _SHORTER_S = (8.0, 7.0, 6.0, 5.0, 4.0)  # tried in turn where a drive is too sho
 
 
 class Cut(NamedTuple):
-    """The origin of a drive: `log` and `segment` count from 0 over all logs, `rows` are the log's own."""
+    """The origin of a drive: its `rows` in log number `log`."""
 
     log: int
-    segment: int
     rows: slice
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRows:
-    """Rows as measured, `group` of them averaged into one, and which of these count.
+    """The rows that count, each the mean of `group` rows of a log.
 
-    `time` (row,) [s] from the start of its log, `stamp` (row,) [s] on that log's own clock, `log` (row,) its number;
-    `command` (row,) [m/s²]; `accel` [m/s²], `speed` [m/s] (row, group) as measured, None where not in the log.
-    `source` (counted,): places of the counted rows; `stretch` (counted,) numbers the stretches without gaps. `dt` [s]
-    of an averaged row.
+    `time` (counted,) [s] from the start of log number `log` (counted,); `command` (counted,) [m/s²]; `measured`: rows
+    of the `channels` as they are in the log, `accel` [m/s²] before `speed` [m/s]. `stretch` (counted,) numbers the
+    stretches without gaps. `dt` [s] of an averaged row.
     """
 
-    time: Float[FloatArray, " row"]
-    stamp: Float[FloatArray, " row"]
-    log: Int[IntArray, " row"]
-    command: Float[FloatArray, " row"]
-    accel: Float[FloatArray, "row group"] | None
-    speed: Float[FloatArray, "row group"] | None
-    source: Int[IntArray, " counted"]
+    time: Float[FloatArray, " counted"]
+    log: Int[IntArray, " counted"]
+    command: Float[FloatArray, " counted"]
+    channels: tuple[str, ...]
+    measured: Float[FloatArray, "channel counted group"]
     stretch: Int[IntArray, " counted"]
     dt: float
     group: int
@@ -73,98 +69,62 @@ class MeasuredRows:
     @property
     def rows(self) -> int:
         """Number of counted rows."""
-        return len(self.source)
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        return tuple(name for name in ("accel", "speed") if getattr(self, name) is not None)
+        return len(self.time)
 
     @property
     def starts(self) -> Int[IntArray, " stretch"]:
         """Index of each stretch's first counted row."""
         return np.flatnonzero(np.diff(self.stretch, prepend=-1))
 
-    @cached_property
-    def measured(self) -> Float[FloatArray, "channel counted group"]:
-        """Measurements of the channels, (channel, counted, group)."""
-        return np.stack([x[self.source] for x in (self.accel, self.speed) if x is not None])
-
 
 @dataclass(frozen=True, eq=False)
 class Record(MeasuredRows):
     """Drives at the log's own rate. `cuts` are their origins; drives of one segment share a road, and `position`
-    continues along it."""
+    continues along it. `source` (counted,): places of the counted rows among the averaged rows of all drives."""
 
     drives: tuple[SimulatorInput, ...]
     cuts: tuple[Cut, ...]
+    source: Int[IntArray, " counted"]
 
     @classmethod
     def of(cls, logs: Log | Iterable[Log]) -> Record:
         """The record of one or several logs of one car. Raises `InputError` where nothing usable is left."""
         each = [logs] if isinstance(logs, Log) else list(logs)
         same_kind(each)
-        drives: list[SimulatorInput] = []
-        cuts: list[Cut] = []
-        columns: dict[str, list[FloatArray]] = defaultdict(list)
-        names = list(dict.fromkeys(log.name for log in each))
-        specific = each[0].accel_kind == "specific-force"
         group = grouped(min(log.rate_hz for log in each), RATE_HZ)
-        steps = []
-        segments = 0
-        for number, log in enumerate(each):
+        channels = tuple(name for name in ("accel", "speed") if getattr(each[0], name) is not None)
+        cuts = [Cut(number, rows) for number, log in enumerate(each) for rows in rolled(log, group)]
+        drives: list[SimulatorInput] = []
+        columns: dict[str, list[FloatArray]] = defaultdict(list)
+        for k, (number, rows) in enumerate(cuts):
+            log = each[number]
             assert log.accel_cmd is not None
-            first_segment = segments - int(log.segment[0])
-            segments = first_segment + int(log.segment[-1]) + 1
-            for cut in rolled(log, group):
-                begun = Cut(number, first_segment + int(log.segment[cut.start]), cut)
-                position0 = _position(log, drives, cuts, begun)
-                cuts.append(begun)
-                rows = (cut.stop - cut.start) // group
-
-                def mean(x: FloatArray, cut: slice = cut, rows: int = rows) -> FloatArray:
-                    return x[cut].reshape(rows, group).mean(1)
-
-                time = log.elapsed[cut][::group]
-                use = log.usable[cut].reshape(rows, group).all(1)
-                settled = time - time[0] >= SETTLE_S - ROUNDING_S
-                step = float(np.median(np.diff(time)))
-                steps.append(step)
-                first = max(1, round(0.3 / step))
-                accel0 = None if log.accel is None else float(mean(log.accel)[:first].mean())
-                own = torch.as_tensor(_even(log.elapsed[cut])), torch.as_tensor(log.accel_cmd[cut])
-                quiet = None
-                if log.speed is not None:
-                    quiet = torch.as_tensor(_quiet(log.speed[cut], float(np.median(np.diff(log.elapsed[cut])))))
-                drives.append(SimulatorInput(*own, quiet, accel0, specific, position0))
-                of_rows = {"time": time, "stamp": log.time[cut][::group], "log": np.full(rows, number)}
-                of_rows |= {"command": mean(log.accel_cmd), "use": (use & settled).astype(float)}
-                measured = {"accel": log.accel, "speed": log.speed}
-                of_rows |= {name: x[cut].reshape(rows, group) for name, x in measured.items() if x is not None}
-                for name, x in of_rows.items():
-                    columns[name].append(x)
-        returns = sum(int((np.diff(log.engaged.astype(int)) == 1).sum()) for log in each)
-        if not drives and all(log.engaged.all() for log in each):
-            raise InputError(f"{', '.join(names)}: no drive of two seconds or more, nothing to diagnose")
-        dt = float(np.median(steps)) if drives else np.inf
+            before = cuts[k - 1].rows if k and cuts[k - 1].log == number else None
+            drives.append(_drive(log, rows, group, _position(log, drives, before, rows)))
+            time = log.elapsed[rows][::group]
+            columns["time"].append(time)
+            columns["log"].append(np.full(len(time), number))
+            columns["command"].append(log.accel_cmd[rows].reshape(-1, group).mean(1))
+            columns["measured"].append(np.stack([getattr(log, x)[rows].reshape(-1, group) for x in channels]))
+            settled = time - time[0] >= SETTLE_S - ROUNDING_S
+            columns["use"].append(log.usable[rows].reshape(-1, group).all(1) & settled)
+        dt = float(np.median([np.median(np.diff(time)) for time in columns["time"]])) if cuts else 1.0
         source, stretch = _places(columns["use"], dt)
-        if not drives or len(source) < 10 / dt:
-            seconds = len(source) * dt if drives else 0.0
+        if len(source) < 10 / dt:
+            returns = sum(int((np.diff(log.engaged.astype(int)) == 1).sum()) for log in each)
             each_return = f" and each of {returns} return{'s' * (returns != 1)} to engaged" if returns else ""
             raise InputError(
-                f"{', '.join(names)}: {seconds:.1f} s of usable driving (moving, engaged, "
-                f"2 s into each drive{each_return}), needs 10 s or more"
+                f"{', '.join(dict.fromkeys(log.name for log in each))}: {len(source) * dt:.1f} s of usable driving "
+                f"(moving, engaged, 2 s into each drive{each_return}), needs 10 s or more"
             )
-
-        whole = {name: np.concatenate(each) for name, each in columns.items()}
         return cls(
             drives=tuple(drives),
             cuts=tuple(cuts),
-            time=whole["time"],
-            stamp=whole["stamp"],
-            log=whole["log"].astype(np.int64),
-            accel=whole.get("accel"),
-            speed=whole.get("speed"),
-            command=whole["command"],
+            time=np.concatenate(columns["time"])[source],
+            log=np.concatenate(columns["log"])[source].astype(np.int64),
+            command=np.concatenate(columns["command"])[source],
+            channels=channels,
+            measured=np.concatenate(columns["measured"], 1)[:, source],
             dt=dt,
             source=source,
             stretch=stretch,
@@ -211,13 +171,27 @@ def rolled(log: Log, group: int) -> Iterator[slice]:
             yield slice(part.start, part.start + rows * group)
 
 
-def _position(log: Log, drives: Sequence[SimulatorInput], cuts: Sequence[Cut], begun: Cut) -> float:
+def _drive(log: Log, rows: slice, group: int, position: float) -> SimulatorInput:
+    """The rows of a log that begin at this position [m] of their road."""
+    assert log.accel_cmd is not None
+    time = log.elapsed[rows]
+    quiet = accel0 = None
+    if log.speed is not None:
+        quiet = torch.as_tensor(_quiet(log.speed[rows], float(np.median(np.diff(time)))))
+    if log.accel is not None:
+        first = group * max(1, round(0.3 / float(np.median(np.diff(time[::group])))))
+        accel0 = float(log.accel[rows][:first].mean())
+    own = torch.as_tensor(_even(time)), torch.as_tensor(log.accel_cmd[rows])
+    return SimulatorInput(*own, quiet, accel0, log.accel_kind == "specific-force", position)
+
+
+def _position(log: Log, drives: Sequence[SimulatorInput], before: slice | None, rows: slice) -> float:
     """Position on its segment's road [m] at which a drive begins; the car also moves during overrides."""
-    if log.speed is None or not cuts or cuts[-1].segment != begun.segment:
+    if log.speed is None or before is None or log.segment[before.start] != log.segment[rows.start]:
         return 0.0
     position = drives[-1].position
     assert position is not None
-    between = slice(cuts[-1].rows.stop - 1, begun.rows.start + 1)
+    between = slice(before.stop - 1, rows.start + 1)
     moved = np.trapezoid(np.maximum(log.speed[between], 0.0), log.elapsed[between])
     return float(position[-1]) + min(float(moved), _FAR_M)
 
@@ -230,8 +204,6 @@ def _even(time: FloatArray) -> FloatArray:
 
 def _quiet(speed: FloatArray, dt: float) -> FloatArray:
     """The measured speed with most of its noise filtered out, for what depends on speed."""
-    from scipy.ndimage import gaussian_filter1d
-
     return np.asarray(np.maximum(gaussian_filter1d(speed, 0.15 / dt, mode="nearest"), 0.0))
 
 

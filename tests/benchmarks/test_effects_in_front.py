@@ -18,7 +18,7 @@ def made(*parts: Part, chance: tuple[ChancePart, ...] = (), T_L: float = 0.3, K_
     """A budget of these parts."""
     unexplained = Unexplained(Quantity(0.0, 0.0, 0.0, 0.0), material=False)
     repaired = {"T_L": Quantity(T_L, 0.01, T_L - 0.02, T_L + 0.02), "K_L": Quantity(K_L, 0.01, K_L - 0.02, K_L + 0.02)}
-    return Budget(2.0, 1.0, {}, parts, unexplained, {"T_L": T_L, "K_L": K_L}, repaired, chance)
+    return Budget(2.0, 1.0, {}, parts, unexplained, repaired, chance)
 
 
 def part(name: str, probability: float = 0.9, /, **sizes: tuple[float, float, float]) -> Part:

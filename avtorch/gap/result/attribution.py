@@ -24,7 +24,7 @@ from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import EFFECT_NATS
 from avtorch.gap.result.budget import Axis, Location
-from avtorch.gap.result.counted_rows import CountedRows
+from avtorch.gap.result.free_runs import CountedRows
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
 _MOST = 0.95  # share of the cause's effect that a part holds
@@ -99,25 +99,19 @@ def _without_sensor(h: Hypothesis) -> FloatArray | None:
     return None if rest is h else rest.response()
 
 
-def localise(attribution: RowAttribution, *, onset_s: float | None, lag: float) -> tuple[Location, ...]:
-    """The significant parts, most significant first. `onset_s`: from the log's start; `lag` [s] of the actuator."""
+def localise(
+    attribution: RowAttribution, *, onset_s: float | None, lag: float, epoch_s: float = 0.0
+) -> tuple[Location, ...]:
+    """The significant parts, most significant first. `onset_s`: from the log's start; `lag` [s] of the actuator;
+    `epoch_s`: the start of the log on its own clock, on which times are stated."""
     parts: list[Part] = [*_stretches(attribution, onset_s, lag), *_signals(attribution), *_band(attribution)]
     q_values = _q_values([gain - attribution.paid for *_, gain in parts])
-    parts = [(axis, *_stamps(attribution, axis, a, b), share, gain) for axis, a, b, share, gain in parts]
-    named = [Location(axis, a, b, share, q) for (axis, a, b, share, _), q in zip(parts, q_values, strict=True)]
+    named = []
+    for (axis, begin, end, share, _), q in zip(parts, q_values, strict=True):
+        if axis == "time" and not isinstance(begin, str) and not isinstance(end, str):
+            begin, end = begin + epoch_s, end + epoch_s
+        named.append(Location(axis, begin, end, share, q))
     return tuple(sorted((w for w in named if w.q_value <= RATE), key=lambda w: w.q_value))
-
-
-def _stamps(
-    attribution: RowAttribution, axis: Axis, begin: float | str, end: float | str
-) -> tuple[float | str, float | str]:
-    """Both ends, with times converted from the log's start to the log's own clock."""
-    if axis != "time" or isinstance(begin, str) or isinstance(end, str):
-        return begin, end
-    record = attribution.record
-    time, stamp = record.time[record.source], record.stamp[record.source]
-    first, last = (int(np.abs(time - t).argmin()) for t in (begin, end))
-    return begin + float(stamp[first] - time[first]), end + float(stamp[last] - time[last])
 
 
 Part = tuple[Axis, float | str, float | str, float, float]
@@ -126,7 +120,7 @@ Part = tuple[Axis, float | str, float | str, float, float]
 
 def _stretches(attribution: RowAttribution, onset_s: float | None, lag: float) -> Iterator[Part]:
     record, does = attribution.record, attribution.does
-    time = record.time[record.source]
+    time = record.time
     one_clock = bool((np.diff(time) > 0).all()) and len(np.unique(record.log)) == 1
     if onset_s is not None and one_clock:
         # random effects (glitches, lost messages) have an onset but no predictable contribution
@@ -135,11 +129,11 @@ def _stretches(attribution: RowAttribution, onset_s: float | None, lag: float) -
     if not does.any():
         return
     axes: list[tuple[Axis, FloatArray]] = [("time", time)] if onset_s is None and one_clock else []
-    if record.speed is not None:
-        axes.append(("speed", record.speed.mean(-1)[record.source]))
+    if "speed" in record.channels:
+        axes.append(("speed", record.measured[-1].mean(-1)))
     # the command filtered by the lag: an effect of the command is visible once the actuator has followed
     share = -np.expm1(-record.dt / lag)
-    command = np.asarray(lfilter([share], [1, share - 1], record.command))[record.source]
+    command = np.asarray(lfilter([share], [1, share - 1], record.command))
     axes.append(("command", command))
     since = time >= onset_s if onset_s is not None and one_clock else np.ones(len(time), bool)
     for axis, x in axes:

@@ -47,12 +47,10 @@ class Predicted(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BlackBox:
-    """Columns beside a hypothesis: `rows` (column, row), each at a `place` (column,) and in a set `kind` (column,), and
-    the `readings` (column, channel, row) and `coefficients` (column, channel, frame, bin) that they make."""
+    """Columns beside a hypothesis, each in a set `kind` (column,), and the `readings` (column, channel, row) and
+    `coefficients` (column, channel, frame, bin) that they make."""
 
     hypothesis: Hypothesis
-    rows: FloatArray = field(repr=False)
-    place: IntArray = field(repr=False)
     kind: IntArray = field(repr=False)
     readings: FloatArray = field(repr=False)
     coefficients: FloatArray = field(repr=False)
@@ -61,14 +59,13 @@ class BlackBox:
     def of(cls, h: Hypothesis) -> BlackBox:
         """The columns that commands, speed, time and the hypothesis's own response make."""
         signals = _signals(h)
-        each = [(_BODY, _forces(h.data, signals))]
+        places = [(_BODY, _forces(h.data, signals))]
         if h.data.channel_count == 2:
-            each += [(_ACCEL, _of_accelerometer(signals)), (_SPEED, _of_speed(signals))]
-        rows = np.array([x for _, sets in each for one in sets for x in one])
-        place = np.array([at for at, sets in each for one in sets for _ in one])
-        kind = np.array([number for _, sets in each for number, one in enumerate(sets) for _ in one])
-        shown = np.stack([_shown(h, at, x) for at, x in zip(place, rows, strict=True)])
-        return cls(h, rows, place, kind, shown, np.stack([h.data.transform(compared(h.data, x)) for x in shown]))
+            places += [(_ACCEL, _of_accelerometer(signals)), (_SPEED, _of_speed(signals))]
+        each = [(place, kind, x) for place, sets in places for kind, columns in enumerate(sets) for x in columns]
+        shown = np.stack([_shown(h, place, x) for place, _, x in each])
+        coefficients = np.stack([h.data.transform(compared(h.data, x)) for x in shown])
+        return cls(h, np.array([kind for _, kind, _ in each]), shown, coefficients)
 
     def predict(self, residuals: FloatArray, errors: FloatArray, blocks: Blocks) -> Predicted:
         """What the columns foretell of each fold's blocks, taught by the `residuals` (fold, channel, frame, bin) of the

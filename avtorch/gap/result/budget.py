@@ -197,9 +197,9 @@ class ChannelError:
 class Budget:
     """The gap's budget: roots of energies `before`, `left` and `floor` (1 by definition), and where they come from.
 
-    `parts` in the order of their shares; these and `unexplained` sum to 1. `baseline`, `repaired`: `T_L` [s] and `K_L`
-    [-] without any cause, and with all parts. Where rollouts show no gap, shares mean nothing.
-    `horizon_s` [s] of the rollouts: 10 s, or the longest stretch.
+    `parts` in the order of their shares; these and `unexplained` sum to 1. `repaired`: `T_L` [s] and `K_L` [-] with all
+    parts. Where rollouts show no gap, shares mean nothing. `horizon_s` [s] of the rollouts: 10 s, or the longest
+    stretch.
     """
 
     before: float
@@ -207,7 +207,6 @@ class Budget:
     by_channel: Mapping[str, ChannelError]
     parts: tuple[Part, ...]
     unexplained: Unexplained
-    baseline: Mapping[str, float]
     repaired: Mapping[str, Quantity]
     chance: tuple[ChancePart, ...] = ()
     material: float = MATERIAL
@@ -329,9 +328,9 @@ def _words(part: Part | ChancePart, behind: str = "") -> str:
     return named_cause(part.name, {key: q.mean for key, q in part.parameters.items()}, behind)
 
 
-def listing(names: Sequence[str]) -> str:
+def listing(names: Sequence[str], last: str = "and") -> str:
     """Names in a sentence."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {last} {names[-1]}"
 
 
 def percent(share: float) -> str:

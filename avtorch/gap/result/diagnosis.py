@@ -68,8 +68,7 @@ class Diagnosis(Displayed, Findings):
 
     - `alarms`: what `avtorch estimate` raised on these drives, where that was given; it is drawn and changes nothing
 
-    The verdict is the budget's where there is one, else the most probable hypothesis. Raises `InputError` where they
-    are inconsistent.
+    The verdict is the budget's where there is one, else the most probable hypothesis.
 
     Example:
         >>> from avtorch import Leader, diagnose, simulate
@@ -177,13 +176,6 @@ class Diagnosis(Displayed, Findings):
         kinds = [*EFFECTS.values(), *(() if self.plant is None else self.plant.effects)]
         own = {e.name for e in kinds if e.own_onset is not None}
         late = " and ".join(name for name in self.verdict.names if name not in own)
-        if self.onset_s is None and self.budget is not None:
-            began = self.log.epochs_s[0]
-            return "".join(
-                f"# In the log {p.name} from {p.onset_s - began:.1f} s of its time on; in this plant from the start.\n"
-                for p in self.budget.parts
-                if p.onset_s is not None and p.name in self.verdict.names and p.name not in own
-            )
         if self.onset_s is None or not late:
             return ""
         return f"# In the log {late} from {sentences.moment(self)} on; in this plant from the start.\n"

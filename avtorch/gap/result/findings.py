@@ -8,15 +8,13 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from avtorch.errors import InputError
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.budget import Budget, Location
 from avtorch.gap.result.free_form import FreeForm
 from avtorch.gap.result.gap_budget import Shrinkage
 from avtorch.gap.result.gap_size import GapSize
-from avtorch.gap.result.hypotheses import Candidate, Scope, Verdict, candidate_name, listed_candidates
+from avtorch.gap.result.hypotheses import AnswerPart, Candidate, Scope, Verdict, candidate_name, listed_candidates
 from avtorch.gap.result.log_facts import LogFacts
-from avtorch.gap.result.parts import AnswerPart
 from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
 from avtorch.gap.result.traces import Alarm, Traces
@@ -25,7 +23,7 @@ from avtorch.gap.simulator.plant import GapPlant
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Findings:
-    """The fields of a `Diagnosis`. Raises `InputError` where they are inconsistent."""
+    """The fields of a `Diagnosis`."""
 
     log: LogFacts
     baseline: Mapping[str, Quantity]
@@ -48,7 +46,6 @@ class Findings:
     complete: bool = True
     scope: Scope | None = None
     notes: tuple[str, ...] = ()
-    onset_from_start_s: float | None = None
     onset_log: int = 0
     budget: Budget | None = None
     tested: SimulatorUnderTest | None = None
@@ -57,16 +54,12 @@ class Findings:
     free_form: FreeForm | None = None
 
     def __post_init__(self) -> None:
-        if self.onset_s is not None and self.onset_from_start_s is None:
-            object.__setattr__(self, "onset_from_start_s", self.onset_s - self.log.epochs_s[self.onset_log])
         object.__setattr__(self, "candidates", listed_candidates(self.candidates))
-        named = self.verdict.name
-        if self.budget is None and self.probability(named) < self.candidates[0].probability - 1e-12:
-            raise InputError(f"verdict: found {named}, needs the most probable, {self.candidates[0].name}")
-        if self.budget is not None and candidate_name(self.budget.verdict) != named:
-            raise InputError(f"verdict: found {named}, needs that of the budget, {candidate_name(self.budget.verdict)}")
-        if named not in self.verdict.alias_set or self.verdict.abstained != (named == "unknown"):
-            raise InputError(f"verdict: found {self.verdict}, needs itself in its alias set, and to abstain on unknown")
+
+    @property
+    def onset_from_start_s(self) -> float | None:
+        """`onset_s` from the first row of its log [s]."""
+        return None if self.onset_s is None else self.onset_s - self.log.epochs_s[self.onset_log]
 
     @property
     def winner(self) -> Candidate:

@@ -102,6 +102,13 @@ class FreeForm:
     sizes: Sizes
     T_L: float
 
+    @property
+    def words(self) -> str:
+        """What it is."""
+        table = ["a force map of command and speed"] if self.sizes.table > 0 else []
+        curve = ["a resistance that depends on the speed"] if self.sizes.resistance > 0 else []
+        return " and ".join([*table, *curve]) or "a gain that free runs teach"
+
     def effects(self) -> list[ForceTable | ResistanceCurve]:
         """As effects of a plant."""
         u, v, curve = (tuple(x.round(_DIGITS).tolist()) for x in (self.knots_u, self.knots_v, self.at.curve))
@@ -550,30 +557,26 @@ class Best(NamedTuple):
 def best_form(car: Car, left: LeftOut, over: FloatArray, independent: float, tried: Sequence[float] = SIZES) -> Best:
     """The free form of a car that does best on blocks left out; `over` (fold,): squares of the baseline there; sizes
     are of those `tried`."""
-    starts = [sizes for sizes in _STARTS if {sizes.resistance, sizes.table} <= set(tried)]
-    found = (_descended(car, left, over, sizes, independent, tried) for sizes in starts)
+    found = []
+    for sizes in _STARTS:
+        if not {sizes.resistance, sizes.table} <= set(tried):
+            continue
+        fit = fitted(car, sizes, car.zero, independent)
+        for _ in range(_DESCENTS):  # the lag follows the sizes, and these follow the lag
+            products = Products(Fit(car, fit.x, cut=True), left)
+
+            def score(z: Sizes, products: Products = products) -> float:
+                squares = products.squares(products.steps(Prior(car, z), independent))
+                return left.worse(squares, over) + 2 * z.nats / independent
+
+            best = min((Sizes(r, f) for r in tried for f in tried), key=score)
+            if best == sizes:
+                break
+            sizes = best
+            fit = fitted(car, sizes, fit.x, independent)
+        told = squares_of(Fit(car, fit.x, cut=True), Prior(car, sizes), left, independent)
+        found.append(Best(left.worse(told, over) + 2 * sizes.nats / independent, sizes, fit))
     return min(found, key=lambda best: best.score)
-
-
-def _descended(
-    car: Car, left: LeftOut, over: FloatArray, sizes: Sizes, independent: float, tried: Sequence[float]
-) -> Best:
-    """From one choice of sizes to the best in its reach: the lag follows the sizes, and these the lag."""
-    fit = fitted(car, sizes, car.zero, independent)
-    for _ in range(_DESCENTS):
-        products = Products(Fit(car, fit.x, cut=True), left)
-
-        def score(z: Sizes, products: Products = products) -> float:
-            squares = products.squares(products.steps(Prior(car, z), independent))
-            return left.worse(squares, over) + 2 * z.nats / independent
-
-        best = min((Sizes(r, f) for r in tried for f in tried), key=score)
-        if best == sizes:
-            break
-        sizes = best
-        fit = fitted(car, sizes, fit.x, independent)
-    told = squares_of(Fit(car, fit.x, cut=True), Prior(car, sizes), left, independent)
-    return Best(left.worse(told, over) + 2 * sizes.nats / independent, sizes, fit)
 
 
 def _sum_told(errors: FloatArray, runs: Runs, told: BoolArray) -> float:

@@ -14,7 +14,7 @@ size at which that is the cost of an effect's presence is the least that shows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -42,14 +42,10 @@ from avtorch.gap.result.budget import (
 from avtorch.gap.result.free_form import FittedForm
 from avtorch.gap.result.free_runs import Blocks
 from avtorch.gap.result.held_out import HeldOut
-from avtorch.gap.result.hypotheses import aliases_of, implausible, onset_of, part_probability
+from avtorch.gap.result.hypotheses import AnswerPart, aliases_of, implausible, map_size, onset_of, part_probability
 from avtorch.gap.result.parameters import ParameterPosterior
-from avtorch.gap.result.parts import AnswerPart, map_size
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
-from avtorch.io import Log
 
-CHANCE = ("gust", "outliers", "command_hold")
-"""Causes that chance decides: no free run foretells them."""
 RESAMPLES = 400
 """Of blocks, with replacement."""
 _NOTHING = 1e-3  # of the energy before, below which free runs show no gap
@@ -103,50 +99,48 @@ def budget_of(
     average: ModelAverage,
     posterior: ParameterPosterior,
     held: HeldOut,
-    logs: Sequence[Log],
     *,
     names: Sequence[str],
+    repaired: Mapping[str, Quantity],
+    chance: Collection[str],
     material: float = MATERIAL,
     seed: int = 0,
-    chance: Sequence[str] = (),
 ) -> Budget:
     """The budget of the causes `names` (or `none`, `unknown`); `posterior`: of the weight that has them all.
 
-    `chance`: names of a user's causes that chance decides. `material`: share of the gap from which what is
-    unexplained is said to matter, where nothing is named by what the evidence says: with `unknown` it does, with
-    `none` it does not.
+    `repaired`: `T_L` [s] and `K_L` [-] of the repaired simulator. `chance`: names of causes that chance decides: no
+    free run foretells them. `material`: share of the gap from which what is unexplained is said to matter, where
+    nothing is named by what the evidence says: with `unknown` it does, with `none` it does not.
     """
     energy, floor = _energies(held)
     draws = _shares(energy, floor, seed)
     shares = {name: draws[:, k] for k, name in enumerate(held.names)}
-    own = posterior.by_effect()
+    by_effect = posterior.by_effect()
     after = dict(zip(held.names, energy.mean(1)[1:], strict=True))
     bottom = float(floor.mean())
-    by_chance = [name for name in dict.fromkeys((*CHANCE, *chance)) if name in names]
+
+    def about(name: str) -> dict[str, Any]:
+        own = by_effect.get(name, {})
+        return {
+            "name": name,
+            "alias_set": aliases_of(average, name),
+            "probability": part_probability(average, name),
+            "parameters": own,
+            "plausible": not implausible(own, {}, [TABLE[name]] if name in TABLE else []),
+        }
+
     parts = []
     for name in names:
-        if name in by_chance or name in ("none", "unknown"):
+        if name in chance or name in ("none", "unknown"):
             continue
         # a road is in the noise's spectrum: it takes off what the black box knows of the place
         share = shares.get(name, np.zeros(len(draws)))
-        began = onset_of(posterior.weight, name, logs)
-        parts.append(
-            Part(
-                name,
-                aliases_of(average, name),
-                part_probability(average, name),
-                Quantity.of_resampled(share[0], share),
-                float(np.sqrt(after.get(name, energy[-1].mean()) / bottom)),
-                own.get(name, {}),
-                None if began is None else began.stamp_s,
-                _plausible(name, own),
-            )
-        )
+        left, began = float(np.sqrt(after.get(name, energy[-1].mean()) / bottom)), onset_of(posterior.weight, name)
+        onset_s = None if began is None else began.stamp_s
+        parts.append(Part(**about(name), share=Quantity.of_resampled(share[0], share), after=left, onset_s=onset_s))
     parts.sort(key=lambda p: -p.share.mean)
-    named_parts = {p.name for p in parts}
     # with what the hypothesis holds and the label does not name
-    rest = sum((share for name, share in shares.items() if name not in named_parts), draws[:, -1])
-    rest = rest if parts else np.ones(len(draws))
+    rest = np.ones(len(draws)) - sum(shares.get(p.name, 0.0) for p in parts)
     beyond = float((rest > material).mean()) if parts else 0.0
     matters = beyond > 0.95 if parts else tuple(names) == ("unknown",)
     if not parts and names[0] not in ("none", "unknown"):  # chance alone is named, and no part of a simulator is
@@ -154,6 +148,7 @@ def budget_of(
     most = max(sum(p.share.mean for p in parts), 1.0)  # an effect without a name may cost instead of taking off
     parts = [replace(p, share=p.share.scaled(1 / most)) for p in parts]
     carried = shares.get("free form")
+    by_chance = [ChancePart(**about(n), share_of_noise=_share_of_noise(posterior, n)) for n in names if n in chance]
     return Budget(
         before=float(np.sqrt(energy[0].mean() / bottom)),
         left=float(np.sqrt(energy[-1].mean() / bottom)),
@@ -166,20 +161,8 @@ def budget_of(
             still=_still(held, seed),
             carried=None if carried is None else Quantity.of_resampled(carried[0], carried),
         ),
-        baseline={key: held.chain[0][key] for key in ("T_L", "K_L")},
-        repaired=posterior.moved(),
-        chance=tuple(
-            ChancePart(
-                name,
-                part_probability(average, name),
-                _share_of_noise(posterior, name),
-                own.get(name, {}),
-                _plausible(name, own),
-                aliases_of(average, name),
-            )
-            for name in by_chance
-            if part_probability(average, name) >= LIKELY
-        ),
+        repaired=repaired,
+        chance=tuple(part for part in by_chance if part.probability >= LIKELY),
         material=material,
         horizon_s=held.horizon_s,
         by_drives=held.blocks.by_drives,
@@ -188,29 +171,27 @@ def budget_of(
 
 def shrinkage_of(held: HeldOut, seed: int = 0) -> Shrinkage:
     """How far the gap shrinks on held-out blocks with all causes, by measure."""
-    blocks, sizes = len(held.blocks.rows), held.blocks.sizes
-    pick = np.random.default_rng(seed).integers(0, blocks, (RESAMPLES, blocks))
     four = (held.steps[0], held.steps[-1], held.floor, held.ceiling)
+    framed = np.flatnonzero(held.frame_rows)  # a block between two frames has no density
+    measures = {f"rollout_rmse_{name}": [x.squares[c] for x in four] for c, name in enumerate(held.data.channels)}
+    measures["log_predictive_density"] = [x.nats[framed] for x in four]
     out: dict[str, MetricShrinkage] = {}
     ceiling: dict[str, float] = {}
-    for c, channel in enumerate(held.data.channels):
-        squares = np.stack([x.squares[c] for x in four])
-        rms = np.sqrt(squares.sum(1) / sizes.sum())
-        drawn = np.sqrt(squares[:, pick].sum(-1) / sizes[pick].sum(-1))
-        name = f"rollout_rmse_{channel}"
-        out[name], ceiling[name] = _metric(rms, drawn, held.horizon_s), float(rms[3])
-    framed = np.flatnonzero(held.frame_rows)  # a block between two frames has no density
-    rows, nats = held.frame_rows[framed], np.stack([x.nats[framed] for x in four])
-    pick = np.random.default_rng(seed).integers(0, len(framed), (RESAMPLES, len(framed)))
-    mean = nats.sum(1) / rows.sum()
-    drawn = nats[:, pick].sum(-1) / rows[pick].sum(-1)
+    for name, each in measures.items():
+        density = name == "log_predictive_density"
+        sums, rows = np.stack(each), held.frame_rows[framed] if density else held.blocks.sizes
+        pick = np.random.default_rng(seed).integers(0, len(rows), (RESAMPLES, len(rows)))
+        levels, drawn = sums.sum(1) / rows.sum(), sums[:, pick].sum(-1) / rows[pick].sum(-1)
+        if not density:
+            levels, drawn = np.sqrt(levels), np.sqrt(drawn)
+        out[name] = _metric(levels, drawn, None if density else held.horizon_s, density=density)
+        ceiling[name] = float(levels[3])
     # the measure in which the gap shows most
-    top = max(out, key=lambda k: out[k].before / max(out[k].floor, 1e-12))
-    if all(x.closed is None for x in out.values()):
+    rollouts = [name for name in measures if name != "log_predictive_density"]
+    top = max(rollouts, key=lambda k: out[k].before / max(out[k].floor, 1e-12))
+    if all(out[name].closed is None for name in rollouts):
         top = "log_predictive_density"
-    out["log_predictive_density"] = _metric(mean, drawn, None, density=True)
-    ceiling["log_predictive_density"] = float(mean[3])
-    return Shrinkage(top, out, ceiling, blocks, held.blocks.by_drives)
+    return Shrinkage(top, out, ceiling, len(held.blocks.rows), held.blocks.by_drives)
 
 
 def families_of(
@@ -354,10 +335,6 @@ def _metric(levels: FloatArray, drawn: FloatArray, horizon: float | None, *, den
         value = (before - after) / (before - floor)
         closed = Quantity.of_resampled(value, shares)
     return MetricShrinkage(float(before), float(after), float(floor), closed, horizon)
-
-
-def _plausible(name: str, own: Mapping[str, Mapping[str, Quantity]]) -> bool:
-    return not implausible(own.get(name, {}), {}, [TABLE[name]] if name in TABLE else [])
 
 
 def _share_of_noise(posterior: ParameterPosterior, name: str) -> float | None:

@@ -16,7 +16,7 @@ from scipy.signal import fftconvolve
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.quantity import plain
-from avtorch.gap.result.counted_rows import CountedRows
+from avtorch.gap.result.free_runs import CountedRows
 from avtorch.gap.rollout_errors import HORIZON_S, reached, rms
 
 WINDOW_S = 10.0
@@ -94,7 +94,7 @@ def gap_size(
     the measurement at every row, and last `HORIZON_S` or as long as the longest stretch: the measures are those of
     `shrinkage`, here over all counted rows. None where the log lacks the channel.
     """
-    one = [] if rows.accel is None else [_one_step(rows, x.errors[0], x.lag) for x in (none, best)]
+    one = [] if "accel" not in rows.channels else [_one_step(rows, x.errors[0], x.lag) for x in (none, best)]
     before, after = (rms(rows, x.errors, none.lag) for x in (none, best))
     return GapSize(
         detected=detected,
@@ -123,7 +123,7 @@ def _one_step(record: CountedRows, errors: FloatArray, lag: float) -> float:
 def repeatability(record: CountedRows) -> Repeatability | None:
     """The repeatability from windows with repeated commands; None where there are none."""
     rows, settled = round(WINDOW_S / record.dt), round(SETTLED_S / record.dt)
-    found = list(_pairs(record.command[record.source], record.stretch, rows))
+    found = list(_pairs(record.command, record.stretch, rows))
     if not found:
         return None
     floors: dict[str, float] = {}

@@ -76,7 +76,9 @@ class HeldOut:
     @property
     def names(self) -> tuple[str, ...]:
         """The effects by the table's names, in the order in which they enter; the free form, without a name, last."""
-        return (*(entered(a, b) for a, b in pairwise(self.chain)), *(["free form"] if self.free else []))
+        steps = pairwise(self.chain)
+        entered = (next(base_name(e) for e in _sized(b) if e not in a.effects) for a, b in steps)
+        return (*entered, *(["free form"] if self.free else []))
 
     def free_gains(self, *, named: bool) -> bool:
         """Whether the free form lowers the errors of free runs, against the baseline and, where they are `named`,
@@ -98,17 +100,20 @@ class HeldOut:
         return np.asarray(frames * float(self.data.frame_rows), np.float64)
 
 
-def held_out_errors(chain: Sequence[Hypothesis], free: FittedForm | None = None) -> HeldOut | None:
-    """The scores of nested hypotheses, fitted to all blocks, the base first (`nested`).
+def held_out_errors(
+    base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis] = (), free: FittedForm | None = None
+) -> HeldOut | None:
+    """The scores of nested hypotheses from `base` to `full`, fitted to all blocks; fits among `visited` are taken as
+    they are.
 
-    `free`: a form beside the last, which the repaired simulator carries: what it leaves is the last step.
-
-    None where the drives are too short for `FEWEST` blocks.
+    `free`: a form beside the last, which the repaired simulator carries: what it leaves is the last step. None where
+    the drives are too short for `FEWEST` blocks.
     """
-    data = chain[-1].data
+    data = full.data
     blocks = Blocks.of(data)
     if blocks is None:
         return None
+    chain = _nested(base, full, visited, blocks)
     fitted = [_taught(h, blocks) for h in chain]
     steps = [x.scores(blocks) for x in fitted]
     ends = (fitted[-1], fitted[0])
@@ -155,26 +160,21 @@ def _apart(full: Hypothesis, scored: Sequence[Scores], blocks: Blocks, free: Fit
     return out
 
 
-def nested(base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis] = ()) -> list[Hypothesis]:
+def _nested(base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis], blocks: Blocks) -> list[Hypothesis]:
     """A chain from `base` to `full`, one more effect at a time, those without which free runs are worst first.
 
-    From `full` on the effect leaves that free runs miss least, all others refitted; fits among `visited` are taken as
-    they are. What chance decides enters with the first effect. Runs are those of the fit: the order is no score.
+    From `full` on the effect leaves that free runs miss least, all others refitted. What chance decides enters with the
+    first effect. Runs are those of the fit: the order is no score.
     """
     known = {_key(h): h for h in visited}
-    floor = _run_squares(full)
+    floor = _run_squares(full, blocks)
     chain = [full]
     while len(_sized(chain[-1])) > 1:
         now = chain[-1]
         rest = {e: known.get(_key(now, e)) or fit(_less(now, e), 6, 0.1) for e in _sized(now)}
-        cost = {e: float((_run_squares(h) / floor).mean()) for e, h in rest.items()}
+        cost = {e: float((_run_squares(h, blocks) / floor).mean()) for e, h in rest.items()}
         chain.append(rest[min(cost, key=lambda e: cost[e])])
     return [base, *(reversed(chain) if _sized(full) else ())]
-
-
-def entered(before: Hypothesis, after: Hypothesis) -> str:
-    """The effect, by the table's name, that one hypothesis has and the one before it has not."""
-    return next(base_name(e) for e in _sized(after) if e not in before.effects)
 
 
 # fits -----------------------------------------------------------------------------------------------------------------
@@ -295,10 +295,8 @@ def _lower(a: Scores, b: Scores) -> Scores:
 
 
 # scores --------------------------------------------------------------------------------------------------------------
-def _run_squares(h: Hypothesis) -> FloatArray:
+def _run_squares(h: Hypothesis, blocks: Blocks) -> FloatArray:
     """Mean squared errors (channel,) of free runs by a fit to all blocks."""
-    blocks = Blocks.of(h.data)
-    assert blocks is not None
     h = _without_chance(h)
     errors = measured_readings(h.data) - readings(h, *h.on_grid())
     return blocks.sums(blocks.free_runs(h.data, errors) ** 2).sum(-1) + 1e-12

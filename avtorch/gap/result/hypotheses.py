@@ -1,7 +1,11 @@
-"""The engine's posterior as the answer's hypotheses: probabilities, parameters, what was tried, the verdict.
+"""The engine's posterior as the answer's hypotheses, verdict and parts: probabilities, parameters, what was tried.
 
 A fit is implausible where the whole central 90 % of a parameter lies outside what is physically possible: the name is
 then right about the shape of the gap and wrong about its origin.
+
+Parts are named effects, and the force map of the car and other free forms as parts without a name. A part is where a
+cause acts, its family, before it is a name. Its size is what it does to the car's acceleration, so that sizes of parts
+compare; shares of the gap are the budget's.
 """
 
 from __future__ import annotations
@@ -9,27 +13,31 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-from avtorch.errors import InputError
-from avtorch.gap.engine.average import ModelAverage, Weight
-from avtorch.gap.engine.coordinates import base_name
-from avtorch.gap.engine.drive_data import DriveData
+import numpy as np
+
+from avtorch.arrays import FloatArray
+from avtorch.gap.engine.average import ModelAverage, Weight, free_form_response
+from avtorch.gap.engine.coordinates import EFFECTS, base_name
+from avtorch.gap.engine.family import FORMS, family_of
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.outliers import rate_onset
+from avtorch.gap.engine.priors import TEMPER
+from avtorch.gap.engine.search import Search
 from avtorch.gap.quantity import Quantity, of_fields, unit_of
-from avtorch.gap.result.budget import LIKELY
+from avtorch.gap.result.budget import LIKELY, Location
 from avtorch.gap.result.parameters import OwnRandom, ParameterPosterior
 from avtorch.gap.simulator.effect import Effect, candidate_name, delay_effect
-from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.plant import BASELINE, GapPlant
-from avtorch.io import Log
+from avtorch.io.units import GRAVITY
 
 ALWAYS = ("none", "unknown")
 LEAST_LISTED = 1e-4
 """Hypotheses less probable than this are left out of an answer; `none` and `unknown` never are."""
 ALIAS_RATIO = 0.03
 """Hypotheses at least this probable, relative to the most probable one, are not distinguished from it."""
+_DRAWS = 400  # of a map's coefficients
 _HELD = 0.9  # probability that an alias set holds
 _MOST_ALIASES = 6
 
@@ -52,12 +60,6 @@ class Candidate:
     onset_s: float | None = None
     implausible: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        if self.name != candidate_name(self.name):
-            raise InputError(f"candidate: found {self.name!r}, needs {candidate_name(self.name)!r}")
-        if not 0 <= self.probability <= 1 + 1e-9:
-            raise InputError(f"{self.name}: found probability {self.probability!r}, needs 0 to 1")
-
     @property
     def effects(self) -> tuple[str, ...]:
         """Its effects: none, one or two."""
@@ -75,18 +77,10 @@ def plausibility(implausible: Sequence[str]) -> dict[str, Any]:
 
 
 def listed_candidates(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
-    """Hypotheses as listed in an answer: improbable ones left out, renormalised to a sum of 1, most probable first.
-
-    Raises `InputError` where `none` or `unknown` is missing, a name occurs twice, or no probability is above 0.
-    """
+    """Hypotheses as listed in an answer: improbable ones left out, renormalised to a sum of 1, most probable first."""
     given = list(candidates)
-    names = [c.name for c in given]
-    if len(set(names)) < len(names) or not set(ALWAYS) <= set(names):
-        raise InputError(f"candidates: found {', '.join(names)}, needs none and unknown and each name once")
     # improbable by their share, so that weights need not be normalised
     total = math.fsum(c.probability for c in given)
-    if not total > 0:
-        raise InputError("candidates: found no probability above 0, needs one")
     kept = [c for c in given if c.name in ALWAYS or c.probability >= LEAST_LISTED * total]
     total = math.fsum(c.probability for c in kept)
     kept.sort(key=lambda c: -c.probability)
@@ -146,51 +140,32 @@ def implausible(
 
     `parameters` of a candidate's `effects`, by their own names or as `effect.parameter`; `moved`: T_L [s] and K_L.
     """
-    sentences = []
-    for effect in effects:
-        for p in (*effect.parameters, *effect.derived):
-            q = parameters.get(f"{effect.name}.{p.name}", parameters.get(p.name))
-            if q is not None and (p.reported or p in effect.derived) and outside(p, q):
-                sentences.append(
-                    f"{_sentence(f'{effect.name}.{p.name}', p, q)}; the effect stands in for something else."
-                )
-    sentences += [
-        f"{_sentence(p.name, p, moved[p.name])}." for p in BASELINE if p.name in moved and outside(p, moved[p.name])
+    each = [
+        (f"{effect.name}.{p.name}", p, parameters.get(f"{effect.name}.{p.name}", parameters.get(p.name)))
+        for effect in effects
+        for p in (*effect.parameters, *effect.derived)
+        if p.reported or p in effect.derived
     ]
-    return tuple(sentences)
+    out = []
+    for name, p, q in (*each, *((p.name, p, moved.get(p.name)) for p in BASELINE)):
+        low, high = p.physical
+        if q is None or (q.q95 >= low and q.q05 <= high):
+            continue
+        unit = unit_of(p.name).replace("-", "")
+        end = "; the effect stands in for something else." if "." in name else "."
+        size = f"{name} is {f'{q.mean:.2g} {unit}'.strip()}, typical {p.low:.2g} to {p.high:.2g}"
+        out.append(f"{size}: possible are {low:.2g} to {high:.2g}{end}")
+    return tuple(out)
 
 
-def outside(parameter: Parameter, q: Quantity) -> bool:
-    """Whether the central 90 % lies entirely outside the possible range."""
-    low, high = parameter.physical
-    return q.q95 < low or q.q05 > high
-
-
-def _sentence(name: str, p: Parameter, q: Quantity) -> str:
-    unit = unit_of(p.name)
-    low, high = p.physical
-    size = f"{name} is {q.mean:.2g}{'' if unit == '-' else ' ' + unit}"
-    return f"{size}, typical {p.low:.2g} to {p.high:.2g}: possible are {low:.2g} to {high:.2g}"
-
-
-@dataclass(frozen=True)
-class Onset:
-    """A time in log number `log`: `stamp_s` on the log's own clock, `from_start_s` from its first row [s]."""
+class Onset(NamedTuple):
+    """A time `stamp_s` [s] on the own clock of log number `log`."""
 
     stamp_s: float
-    from_start_s: float
     log: int
 
-    @classmethod
-    def at(cls, data: DriveData, logs: Sequence[Log], time: float) -> Onset:
-        """The time [s] of the data's own clock."""
-        row = int(abs(data.time - time).argmin())
-        number = int(data.log[row])
-        stamp = float(data.stamp[row] + time - data.time[row])
-        return cls(stamp, stamp - logs[number].epoch_s, number)
 
-
-def onset_of(weight: Weight, name: str, logs: Sequence[Log]) -> Onset | None:
+def onset_of(weight: Weight, name: str) -> Onset | None:
     """Since when a cause of the weight's label acts; None: from the start."""
     h = weight.examined.hypothesis
     time = next((t for e, t in h.onsets.items() if base_name(e) == name), None)
@@ -202,12 +177,15 @@ def onset_of(weight: Weight, name: str, logs: Sequence[Log]) -> Onset | None:
         time = _rate_onset(h, [i for i, _ in h.lost])
     elif name == "outliers" and weight.examined.outliers is not None:
         time = _rate_onset(h, weight.examined.outliers.starts.tolist())
-    return None if time is None else Onset.at(h.data, logs, time)
+    if time is None:
+        return None
+    row = int(abs(h.data.time - time).argmin())
+    return Onset(float(h.data.stamp[row] + time - h.data.time[row]), int(h.data.log[row]))
 
 
-def first_onset(weight: Weight, names: Sequence[str], logs: Sequence[Log]) -> Onset | None:
+def first_onset(weight: Weight, names: Sequence[str]) -> Onset | None:
     """The onset of the first of these causes that has one."""
-    return next((x for x in (onset_of(weight, name, logs) for name in names) if x is not None), None)
+    return next((x for x in (onset_of(weight, name) for name in names) if x is not None), None)
 
 
 def _rate_onset(h: Hypothesis, rows: Sequence[int]) -> float | None:
@@ -265,7 +243,6 @@ def best_weight(average: ModelAverage, names: Sequence[str]) -> Weight:
 
 def candidates_of(
     average: ModelAverage,
-    logs: Sequence[Log],
     kinds: Sequence[type[Effect]],
     posterior: ParameterPosterior | None,
     random: Sequence[OwnRandom] = (),
@@ -279,16 +256,12 @@ def candidates_of(
         if weight is None or label == "unknown":
             out.append(Candidate(label, p))
             continue
-        own = (
-            posterior
-            if posterior is not None and posterior.weight is weight
-            else ParameterPosterior(weight, own=random)
-        )
+        own = posterior if posterior and posterior.weight is weight else ParameterPosterior(weight, own=random)
         posteriors[label] = own
         parameters: dict[str, Quantity] = {} if label == "none" or p < LEAST_LISTED else own.named()
         moved = own.moved()
         odd = implausible(parameters, moved, [k for k in kinds if k.name in label.split("+")])
-        onset = None if label == "none" else first_onset(weight, label.split("+"), logs)
+        onset = None if label == "none" else first_onset(weight, label.split("+"))
         out.append(
             Candidate(
                 label,
@@ -359,3 +332,144 @@ def given_dead_time(
             )
         )
     return tuple(sorted(out, key=lambda c: -c.probability))
+
+
+# parts --------------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class AnswerPart:
+    """A part of what the simulator lacks: `name` of an effect, None of a free form; its `family`; `form` of a free one.
+
+    `size_mps2`: root mean square of what it adds to the acceleration or to the rate of the speed, None where that is
+    not measured. `where` a free form acts, in time, speed, command, frequency.
+
+    """
+
+    name: str | None
+    family: str
+    form: str | None
+    size_mps2: Quantity | None
+    probability: float
+    where: tuple[Location, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `parts` in `diagnosis.json`."""
+        return of_fields(self)
+
+
+@dataclass(frozen=True, eq=False)
+class UnnamedResponse:
+    """What a free `form` beside a `hypothesis` does: `change` (channel, frame, bin), and `size_mps2` of it, the root
+    mean square over the rows of the channel that shows it most."""
+
+    form: str
+    hypothesis: Hypothesis
+    change: FloatArray = field(repr=False)
+
+    @property
+    def size_mps2(self) -> float:
+        data = self.hypothesis.data
+        rows = max(data.frame_count * data.frame_rows, 1)
+        return float(np.sqrt((self.change**2).sum((1, 2)).max() / rows))
+
+
+def unnamed_response(average: ModelAverage, weight: Weight, search: Search) -> UnnamedResponse | None:
+    """What the likeliest free form does beside the weight's hypothesis, if one is likely, or stands for `unknown`."""
+    if not average.parts:
+        return None
+    form, probability = max(average.parts.items(), key=lambda kv: kv[1])
+    if weight.label == "unknown":
+        form = weight.part or form
+    elif sum(p for f, p in average.parts.items() if family_of(f) == family_of(form)) < LIKELY:
+        return None
+    change = free_form_response(weight.examined, search, form) if probability >= LEAST_LISTED else None
+    return None if change is None else UnnamedResponse(form, weight.examined.hypothesis, change)
+
+
+def parts_of(
+    average: ModelAverage,
+    names: Sequence[str],
+    posterior: ParameterPosterior,
+    seed: int = 0,
+    unnamed: UnnamedResponse | None = None,
+    where: tuple[Location, ...] = (),
+) -> tuple[AnswerPart, ...]:
+    """The named parts of the verdict, in its order, then the force map and the other free forms, the likeliest first;
+    `posterior`: of the verdict's weight; `unnamed`: what the likeliest free form does, and `where`."""
+    parts = [
+        AnswerPart(name, family_of(name), None, _size(posterior, name), part_probability(average, name))
+        for name in names
+        if name not in ("none", "unknown")
+    ]
+    present = min(sum(average.force_maps.values()), 1.0)  # which rounding may exceed
+    weight = _with_map(average, posterior.weight)
+    if weight is not None and present >= LEAST_LISTED:
+        h = weight.examined.hypothesis
+        form = max(average.force_maps, key=lambda name: average.force_maps[name])
+        parts.append(AnswerPart(None, "force map", form, map_size(h, seed), present))
+    for form, probability in sorted(average.parts.items(), key=lambda kv: -kv[1]):
+        if probability >= LEAST_LISTED:
+            own = unnamed is not None and unnamed.form == form
+            size = Quantity(unnamed.size_mps2, 0.0, *2 * [unnamed.size_mps2]) if own and unnamed is not None else None
+            parts.append(AnswerPart(None, family_of(form), form, size, probability, where if own else ()))
+    return tuple(parts)
+
+
+def said_of_unnamed(parts: Sequence[AnswerPart], unknown: bool = False, epoch_s: float = 0.0) -> str:
+    """A sentence on the likely part without a name, or on what an `unknown` cause is most like; else nothing. Times
+    count from `epoch_s`."""
+    free = [p for p in parts if p.name is None]
+    family = max(free, key=lambda p: p.probability).family if free else ""
+    own = [p for p in free if p.family == family]
+    probability = min(sum(p.probability for p in own), 1.0)
+    if not own or (probability < LIKELY and not unknown):
+        return ""
+    part = max(own, key=lambda p: (p.size_mps2 is not None, p.probability))
+    words = f"{FORMS[part.form][1]} ({family})" if part.form in FORMS else f"the force map {part.form}"
+    size = [] if part.size_mps2 is None else [f"{part.size_mps2.mean:.2g} m/s² in the root mean square"]
+    what = ", ".join([words, *size, *(place.words(epoch_s) for place in part.where)])
+    return f"{'It is most like' if unknown else 'A part without a name is'} {what} (probability {probability:.2g})."
+
+
+def map_size(h: Hypothesis, seed: int = 0) -> Quantity:
+    """Root mean square [m/s²] over the drive's rows of the force beyond K u, by Laplace's approximation."""
+    assert h.force is not None
+    n, b = h.force.count, h.force_coefficients
+    covariance = np.linalg.inv(h.information)[-n:, -n:] / TEMPER
+    sizes, turn = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    random = np.random.default_rng(seed).standard_normal((_DRAWS, n))
+    draws = b + random * np.sqrt(np.maximum(sizes, 0.0)) @ turn.T
+    return Quantity.of_draws(np.sqrt(np.einsum("dk,kl,dl->d", draws, h.force.gram, draws)))
+
+
+def _with_map(average: ModelAverage, weight: Weight) -> Weight | None:
+    """The weight, or else the strongest of the average, that has a force map."""
+    having = [w for w in average.best.values() if w.examined.hypothesis.force is not None]
+    if weight.examined.hypothesis.force is not None:
+        return weight
+    return max(having, key=lambda w: w.log_weight, default=None)
+
+
+def _size(posterior: ParameterPosterior, name: str) -> Quantity | None:
+    h = posterior.hypothesis
+    own = posterior.by_effect().get(name, {})
+    if name == "gust" and "sd_mps2" in own:
+        return own["sd_mps2"]
+    if name == "road_grade" and "grade_rms" in own:
+        return own["grade_rms"].scaled(GRAVITY)
+    effect = next((e for e in h.effects if base_name(e) == name), None)
+    if effect is None:
+        return None
+    does = [a - b for a, b in zip(h.rows(), h.without(effect).rows(), strict=True)]
+    size = max(float(np.sqrt((x**2).mean())) for x in does)
+    return Quantity.of_draws(size * _relative(posterior, effect))
+
+
+def _relative(posterior: ParameterPosterior, effect: str) -> FloatArray:
+    """Draws (draw,) of the size of an effect's first coordinate over that of the fit."""
+    h, coordinates = posterior.hypothesis, EFFECTS[effect].coordinates
+    if not coordinates:
+        return np.ones(1)
+    first = coordinates[0]
+    neutral = h.without(effect)[first.name]
+    at = h[first.name] - neutral
+    return np.abs(posterior.draws[first.name].reshape(-1) - neutral) / max(abs(at), 1e-12)

@@ -136,10 +136,9 @@ class ParameterPosterior:
         shape = self._given.x.shape[:2]
         out = {name: self._given[name] for name in ("T_L", "K_L")}
         for e in self.effects:
-            reported = self._drawn(e).report(torch.as_tensor(self._column("T_L").copy()))
-            pair = len(self.names) > 1
-            for key, x in reported.items():
-                out[f"{base_name(e)}.{key}" if pair else key] = x.expand(shape[0] * shape[1]).numpy().reshape(shape)
+            for key, x in self._reported(e).items():
+                name = f"{base_name(e)}.{key}" if len(self.names) > 1 else key
+                out[name] = x.expand(shape[0] * shape[1]).numpy().reshape(shape)
         return out
 
     @property
@@ -153,12 +152,8 @@ class ParameterPosterior:
 
     def by_effect(self) -> dict[str, dict[str, Quantity]]:
         """Parameters of each named cause, by the table's names."""
-        out = {}
-        for e in self.effects:
-            effect = self._drawn(e)
-            reported = effect.report(torch.as_tensor(self._column("T_L").copy()))
-            out[base_name(e)] = {key: Quantity.of_draws(x) for key, x in reported.items()}
-        return out | self._random()
+        of_car = {e: {key: Quantity.of_draws(x) for key, x in self._reported(e).items()} for e in self.effects}
+        return {base_name(e): own for e, own in of_car.items()} | self._random()
 
     def named(self) -> dict[str, Quantity]:
         """The same in one mapping: of one cause by its parameters' names, of several as `effect.parameter`."""
@@ -179,13 +174,12 @@ class ParameterPosterior:
                     out[f"{effect.name}.{p.name}"] = value.numpy()[::every][:count]
         return out
 
-    def plant(self, baseline: GapPlant | None, sigma: float) -> GapPlant:
+    def plant(self, baseline: GapPlant | None) -> GapPlant:
         """The repaired simulator at the mode, with its random causes. Effects act from the start of a drive, even where
         the car has them from an onset, but for a change of the gain."""
         named = self.hypothesis.copy()
         named.effects = list(self.effects)
-        car = plant_of(named, baseline)
-        return plant(self._random_effects(), baseline=car, sigma=sigma)
+        return plant(self._random_effects(), baseline=plant_of(named, baseline), sigma=self.weight.process_noise)
 
     # inside --------------------------------------------------------------------------------------------------------
     def _drawn(self, e: str) -> Effect:
@@ -201,6 +195,9 @@ class ParameterPosterior:
             draws = np.random.default_rng(self._seed).normal(0, relative, len(self._column("T_L")))
             given["hold_fraction"] = torch.as_tensor(np.clip(p * np.exp(draws), 1 / rows, 0.999))
         return kind(**{f.name: given[f.name] for f in fields(kind) if f.name in given})
+
+    def _reported(self, e: str) -> Mapping[str, torch.Tensor]:
+        return self._drawn(e).report(torch.as_tensor(self._column("T_L").copy()))
 
     def _random(self) -> dict[str, dict[str, Quantity]]:
         """Sizes of the random causes that the label names."""
@@ -265,16 +262,13 @@ def road_along(h: Hypothesis, road: RoadGrade) -> RoadGrade:
     prepared = road.prepared(torch.as_tensor(data.time), torch.as_tensor(data.smooth_speed), position)
     size = float(torch.as_tensor(road.grade_rms))
     columns = prepared.columns(position).numpy() * size
-    shown = [data.accel is not None and data.accel_kind == "kinematic", data.speed is not None]
-    channels = [x for x, there in zip(shown, (data.accel is not None, data.speed is not None), strict=True) if there]
-    white = np.array([whiten(data, h.covariance, _force(data.transform([c])[0], channels)) for c in columns.T])
+    # an accelerometer does not feel a slope
+    shows = np.array([name == "speed" or data.accel_kind == "kinematic" for name in data.channels], float)
+    forces = [np.multiply.outer(shows, data.transform([c])[0]) for c in columns.T]
+    white = np.array([whiten(data, h.covariance, force) for force in forces])
     A = white @ white.T + np.eye(len(white))
     profile = np.linalg.solve(A, white @ whiten(data, h.covariance, h.residual))
     return replace(prepared, profile=torch.as_tensor(profile))
-
-
-def _force(coefficients: FloatArray, channels: list[bool]) -> FloatArray:
-    return np.stack([coefficients if there else np.zeros_like(coefficients) for there in channels])
 
 
 def _log_normal(value: float, spread: float) -> Quantity:

@@ -95,7 +95,7 @@ class PredictiveModel:
         grade = weight.composition.slow.road_sd / GRAVITY if "road_grade" in posterior.names else None
         return cls(
             name=weight.label,
-            plant=posterior.plant(baseline, weight.process_noise),
+            plant=posterior.plant(baseline),
             belief=posterior.belief(_DRAWS),
             noise=noise,
             grade_rms=grade,

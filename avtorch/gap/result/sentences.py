@@ -5,26 +5,18 @@ from __future__ import annotations
 from avtorch.gap.result.budget import listing
 from avtorch.gap.result.findings import Findings
 from avtorch.gap.result.hypotheses import Scope
-from avtorch.gap.simulator.effect import EFFECTS, named_cause
+from avtorch.gap.simulator.effect import named_cause
 from avtorch.io.clock import clock_words
 
 SURE = 0.9
 """Probability from which a headline is unqualified."""
-_UNIT = {"speed": "m/s", "accel": "m/s²"}
-_WORD = {"speed": "speed", "accel": "acceleration"}
+_CHANNEL = {"speed": ("speed", "m/s"), "accel": ("acceleration", "m/s²")}
 _ALIASES = 4  # hypotheses named beside the verdict
 _UNTRIED = 6  # names of effects listed as not tried
-_MEASURES = {
-    "rollout_rmse_accel": ("acceleration", "m/s²"),
-    "rollout_rmse_speed": ("speed", "m/s"),
-}
 
 
 def headline(found: Findings) -> str:
-    """The verdict as one sentence; provisional where the budget ended the search.
-
-    It states an implausible fit; the winner's `implausible` gives the reasons.
-    """
+    """The verdict as one sentence; provisional where the budget ended the search."""
     return _verdict(found) if found.complete else f"Provisional: {_verdict(found)}"
 
 
@@ -37,8 +29,7 @@ def _verdict(found: Findings) -> str:
     odd = found.winner.implausible
     but = ", but as fitted it is physically implausible" if odd else ""
     if verdict.name == "none" and not _all_tried(found):
-        comma = "," if _cut(found) else ""
-        return f"None of the {_known(found)}{comma} brings the simulator closer to this log ({p}){but}."
+        return f"None of the {_known(found)} brings the simulator closer to this log ({p}){but}."
     if verdict.name == "none" and found.tested is not None and found.tested.wrong:
         wrong = " and ".join(str(p) for p in found.tested.wrong)
         return f"The simulator lacks nothing that this log shows ({p}), but a parameter is wrong: {wrong}."
@@ -61,11 +52,7 @@ def _lacks(found: Findings, p: str) -> str:
     names = " and ".join(verdict.names)
     if winner.implausible:  # the fit is not described by the effects' usual meaning
         return f"{who} simulator lacks {names} ({p}), but as fitted that is physically implausible."
-    causes = [_cause(found, name) for name in verdict.names]
-    if any(words == name for name, words in zip(verdict.names, causes, strict=True)):
-        meaning = ", and ".join(EFFECTS[n].meaning for n in sorted(verdict.names) if n in EFFECTS)
-        return f"{who} simulator lacks {names} ({p}){f': {meaning}' if meaning else ''}."
-    return f"{who} simulator lacks this ({p}): {', and '.join(causes)}."
+    return f"{who} simulator lacks this ({p}): {', and '.join(_cause(found, name) for name in verdict.names)}."
 
 
 def _cause(found: Findings, name: str) -> str:
@@ -94,7 +81,7 @@ def tested(found: Findings) -> list[str]:
         f"Of the simulator itself ({facts.name}{adjusted}): it answers as a lag of {lag:.2f} s and a gain of {gain:.2f}"
         f"{holds}, but for {100 * left:.1f} % of its response, which is taken from its output."
     ]
-    errors = [f"{name} {value:.2g} {_UNIT[name]}" for name, value in facts.rollout.items()]
+    errors = [f"{name} {value:.2g} {_CHANNEL[name][1]}" for name, value in facts.rollout.items()]
     if errors:
         lines.append(f"Its error against the car as it is, over 10 s: {', '.join(errors)}.")
     said = headline(found)
@@ -124,8 +111,9 @@ def budget(found: Findings) -> list[str]:
     rest = found.budget.unexplained.rest(found.budget.material)
     errors, floors = [], []
     for name, error in found.budget.by_channel.items():
-        errors.append(f"in {_WORD[name]} from {error.before:.2g} to {error.left:.2g} {_UNIT[name]}")
-        floors.append(f"{error.floor:.2g} {_UNIT[name]}")
+        word, unit = _CHANNEL[name]
+        errors.append(f"in {word} from {error.before:.2g} to {error.left:.2g} {unit}")
+        floors.append(f"{error.floor:.2g} {unit}")
     return [
         *line,
         *beside,
@@ -136,11 +124,7 @@ def budget(found: Findings) -> list[str]:
 
 
 def onset(found: Findings) -> list[str]:
-    """The sentence on the onset; with several causes one for each that sets in during the drive."""
-    late = [] if found.budget is None else [p for p in found.budget.parts if p.onset_s is not None]
-    if late and found.onset_s is None:
-        began = found.log.epochs_s[0]
-        return [f"{p.name} sets in {(p.onset_s or 0.0) - began:.1f} s after the log's start." for p in late]
+    """The sentence on the onset."""
     if found.onset_s is not None:
         return [f"The gap begins at {moment(found)}."]
     return ["The gap is there from the start."] if found.winner.effects else []
@@ -167,34 +151,22 @@ def where(found: Findings) -> list[str]:
 
 
 def shrinkage(found: Findings) -> list[str]:
-    """How far the gap shrinks on held-out data; no second time where the budget's sentence has said so."""
+    """How far a repaired simulator in which nothing has a name shrinks the gap on held-out data; where something has
+    one, the budget's sentence says it."""
     scores = found.shrinkage
-    if scores is None:
-        return []
-    if budget(found):
+    if scores is None or budget(found):
         return []
     top = scores.top
-    parts = "drives" if scores.by_drives else "blocks"
-    many = len(found.verdict.names) > 1
-    what, closes = ("the effects", "close") if many else ("the effect", "closes")
-    before, after = f"without {what}", "with them" if many else "with it"
-    if found.free_form is not None:
-        what, closes, before, after = "that", "closes", "of the baseline", "of the repaired simulator"
-    if scores.metric in _MEASURES:
-        words, unit = _MEASURES[scores.metric]
-        over = _over(top.horizon_s)
-        line = (
-            f"On held-out {parts}{over}: {words} error {top.before:.2g} {unit} {before}, {top.after:.2g} {unit} {after}"
-        )
-    else:
-        density = f"log predictive density {top.after - top.before:+.2g} nats per row"
-        by = f"with {what}" if found.free_form is None else after
-        line = f"On held-out {parts}: {density} {by}; rollouts do not show it"
-    if top.closed is None:
-        return [f"{line}; almost none of the gap is reducible."]
+    word, unit = _CHANNEL.get(scores.metric.removeprefix("rollout_rmse_"), ("", ""))
+    line = f"{_over(top.horizon_s)}: {word} error {top.before:.2g} {unit} of the baseline, {top.after:.2g} {unit}"
+    if not word:
+        line = f": log predictive density {top.after - top.before:+.2g} nats per row, which rollouts do not show,"
     q = top.closed
-    share = f"{100 * q.mean:.0f} % ({100 * q.q05:.0f} to {100 * q.q95:.0f})"
-    return [f"{line}; {what} {closes} {share} of the reducible gap."]
+    end = "almost none of the gap is reducible"
+    if q is not None:
+        end = f"that closes {100 * q.mean:.0f} % ({100 * q.q05:.0f} to {100 * q.q95:.0f}) of the reducible gap"
+    parts = "drives" if scores.by_drives else "blocks"
+    return [f"On held-out {parts}{line} of the repaired simulator; {end}."]
 
 
 def moved(found: Findings) -> list[str]:
@@ -210,7 +182,8 @@ def moved(found: Findings) -> list[str]:
 
 def aliases(found: Findings) -> str:
     """The hypotheses that the log cannot distinguish from the verdict."""
-    from_words = {"none": "no effect at all", "unknown": "a cause outside the table"}
+    tried = found.scope is None or not found.scope.not_scored
+    words = {"none": "no effect at all", "unknown": f"a cause {'outside the table' if tried else 'that was not tried'}"}
     if found.budget is not None and len(found.verdict.names) > 2:
         each = (*found.budget.parts, *found.budget.chance)
         alike = [(p.name, [n for n in p.alias_set if n != p.name]) for p in each if p.name in found.verdict.names]
@@ -218,17 +191,14 @@ def aliases(found: Findings) -> str:
         if not confused:
             return "No other known cause explains this log as well."
         return f"This log cannot distinguish {', nor '.join(confused)}."
-    if _cut(found):
-        from_words["unknown"] = "a cause that was not tried"
-    others = [from_words.get(n, n.replace("+", " with ")) for n in found.verdict.alias_set if n != found.verdict.name]
+    others = [words.get(n, n.replace("+", " with ")) for n in found.verdict.alias_set if n != found.verdict.name]
     if not others:
         which = "known cause" if _all_tried(found) else "cause that was tried"
         return f"No {'' if found.verdict.name == 'none' else 'other '}{which} explains this log as well."
     if len(others) > _ALIASES + 1:
         others = [*others[:_ALIASES], f"any of {len(others) - _ALIASES} less probable hypotheses"]
-    alike = others[0] if len(others) == 1 else f"{', '.join(others[:-1])} or {others[-1]}"
-    name = from_words.get(found.verdict.name, found.verdict.name.replace("+", " with "))
-    return f"This log cannot distinguish {name} from {alike}."
+    name = words.get(found.verdict.name, found.verdict.name.replace("+", " with "))
+    return f"This log cannot distinguish {name} from {listing(others, 'or')}."
 
 
 def untried(scope: Scope) -> list[str]:
@@ -241,11 +211,6 @@ def untried(scope: Scope) -> list[str]:
     return [f"Not tried: {listing(parts)}. Probabilities cover only what was tried; unknown stands for the rest."]
 
 
-def _cut(found: Findings) -> bool:
-    """Whether single effects were not tried."""
-    return found.scope is not None and bool(found.scope.not_scored)
-
-
 def _all_tried(found: Findings) -> bool:
     return found.complete and (found.scope is None or found.scope.whole)
 
@@ -254,10 +219,8 @@ def _known(found: Findings) -> str:
     """The set of effects that the sentence excludes."""
     if found.scope is None or _all_tried(found):
         return "effects known here"
-    if not _cut(found):
-        return "single effects known here" if found.scope.pairs == "none" else "effects and pairs tried so far"
-    which = "single effects" if found.scope.pairs == "none" else "effects"
-    return f"{which} tried, {len(found.scope.scored)} of {len(found.scope.scored + found.scope.not_scored)}"
+    tried = f"effects tried, {len(found.scope.scored)} of {len(found.scope.scored + found.scope.not_scored)}"
+    return f"single {tried}" if found.scope.pairs == "none" else tried
 
 
 def gap(found: Findings) -> list[str]:

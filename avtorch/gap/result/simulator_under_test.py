@@ -34,9 +34,7 @@ class ParameterDifference:
 
     def __str__(self) -> str:
         effect, _, key = ("", "", self.name) if self.own else self.name.rpartition(".")
-        unit = (
-            ("" if self.own else {"T_L": " s", "K_L": ""}[key]) if not effect else f" {unit_of(key)}".replace(" -", "")
-        )
+        unit = "" if self.own else f" {unit_of(key)}".replace(" -", "")
         words = f"{effect}: {words_of(key)}" if effect else key
         shown = _short if effect or self.own else "{:.2f}".format
         own, mean, low, high = map(shown, (self.simulator, self.car.mean, self.car.q05, self.car.q95))

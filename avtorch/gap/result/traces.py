@@ -67,12 +67,9 @@ class Traces:
         cls, rows: MeasuredRows, before: FloatArray, after: FloatArray, does: FloatArray, logs: Sequence[Log] = ()
     ) -> Self:
         """Of counted rows; `before`, `after` (channel, row, group): the simulator's. `logs`: for what did not count."""
-        at = rows.source
         measured, before, after = (x.mean(-1) for x in (rows.measured, before, after))
         left_out = uncounted(logs, rows) if logs else ()
-        return cls(
-            rows.time[at], rows.command[at], rows.channels, measured, before, after, does, rows.stretch, left_out
-        )
+        return cls(rows.time, rows.command, rows.channels, measured, before, after, does, rows.stretch, left_out)
 
     @property
     def step(self) -> float:
@@ -93,11 +90,8 @@ class Traces:
     @cached_property
     def piece(self) -> IntArray:
         """Number (row,) of the rollout of at most `HORIZON_S` that a row belongs to; each stretch begins one."""
-        firsts = np.flatnonzero(np.diff(self.stretch, prepend=self.stretch[:1] - 1))
-        since = self.time - self.time[firsts][np.searchsorted(firsts, np.arange(len(self.time)), side="right") - 1]
-        begins = (np.diff(self.stretch, prepend=self.stretch[:1] - 1) != 0) | (
-            np.diff(since // HORIZON_S, prepend=-1.0) > 0
-        )
+        since = np.concatenate([self.time[rows] - self.time[rows[0]] for rows in self.stretches])
+        begins = (np.diff(self.stretch, prepend=-1) != 0) | (np.diff(since // HORIZON_S, prepend=-1.0) > 0)
         return np.cumsum(begins) - 1
 
     def begun_anew(self, simulated: FloatArray) -> FloatArray:
@@ -131,13 +125,13 @@ class Traces:
 def uncounted(logs: Sequence[Log], record: MeasuredRows) -> tuple[Uncounted, ...]:
     """What `record`, made of these `logs`, does not count, in order of time."""
     found: list[Uncounted] = []
-    for number, counted in enumerate(np.unique(record.log[record.source]).tolist()):
+    for number, counted in enumerate(np.unique(record.log).tolist()):
         log = logs[counted]
-        own = record.source[record.log[record.source] == counted]
+        counts = record.time[record.log == counted]
         why = np.full(log.rows, _REASONS.index("settling"))
         # averaged rows: from the stamp of the first of each to the next
-        last = np.searchsorted(record.time[own], log.elapsed + 1e-6 * record.dt, side="right") - 1
-        why[(last >= 0) & (log.elapsed - record.time[own][last] < (1 - 1e-3) * record.dt)] = -1
+        last = np.searchsorted(counts, log.elapsed + 1e-6 * record.dt, side="right") - 1
+        why[(last >= 0) & (log.elapsed - counts[last] < (1 - 1e-3) * record.dt)] = -1
         why[(why >= 0) & ~log.moving] = _REASONS.index("standstill")
         why[(why >= 0) & ~log.engaged] = _REASONS.index("driver")
         for part, after in pairwise([*log.segments(), None]):

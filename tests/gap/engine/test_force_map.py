@@ -24,7 +24,7 @@ from avtorch.gap.engine.gauss_newton import force_columns, linearised
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.inference import Inference, infer
 from avtorch.gap.engine.recorder import base_fit
-from avtorch.gap.result.parts import map_size
+from avtorch.gap.result.hypotheses import map_size
 from avtorch.io import Log
 from tests.gap.cars import log_of
 

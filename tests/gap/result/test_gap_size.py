@@ -11,7 +11,7 @@ import torch
 from avtorch.arrays import FloatArray
 from avtorch.gap import DeadTime, Effect, SimulatorInput, plant
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.result.counted_rows import CountedRows
+from avtorch.gap.result.free_runs import CountedRows
 from avtorch.gap.result.gap_size import Simulated, gap_size
 from avtorch.gap.rollout_errors import HORIZON_S
 from avtorch.io import Log

@@ -36,7 +36,7 @@ def test_a_speed_range_is_named_and_a_uniform_cause_is_not(record: Record) -> No
 
 
 def test_braking_is_named(record: Record) -> None:
-    command = record.command[record.source]
+    command = record.command
     named = localise(_shown(np.maximum(-command, 0) ** 2 + 1e-9, record), onset_s=None, lag=0.05)
     part = next(w for w in named if w.axis == "command")
     assert float(part.end) < 0.15
@@ -44,7 +44,7 @@ def test_braking_is_named(record: Record) -> None:
 
 
 def test_an_onset_is_a_part_of_the_time(record: Record) -> None:
-    time = record.time[record.source]
+    time = record.time
     named = localise(_shown((time > 70) + 0.0, record), onset_s=70.0, lag=0.3)
     part = next(w for w in named if w.axis == "time")
     assert (part.begin, part.end) == (70.0, time[-1])

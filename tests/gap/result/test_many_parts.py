@@ -44,7 +44,6 @@ def seven() -> Diagnosis:
         by_channel={"speed": ChannelError(0.6, 0.1, 0.18)},
         parts=tuple(parts),
         unexplained=Unexplained(about(1 - sum(SHARES)), material=False, probability=0.2),
-        baseline={"T_L": 0.3, "K_L": 1.0},
         repaired={"T_L": about(0.4), "K_L": about(0.9)},
     )
     named = {f"{part.name}.{key}": q for part in parts for key, q in part.parameters.items()}

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from avtorch.gap.engine.average import ModelAverage
-from avtorch.gap.result.parts import FORMS, parts_of, said_of_unnamed
+from avtorch.gap.engine.family import FORMS
+from avtorch.gap.result.hypotheses import parts_of, said_of_unnamed
 
 
 def average(parts: dict[str, float]) -> ModelAverage:

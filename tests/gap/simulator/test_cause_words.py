@@ -96,7 +96,6 @@ def test_a_budget_says_them_with_their_names_behind() -> None:
         parts,
         Unexplained(Quantity(0.04, 0.0, 0.0, 0.1), material=False),
         {},
-        {},
         (ChancePart("gust", 0.9, parameters=gust),),
     )
     assert str(budget) == (
