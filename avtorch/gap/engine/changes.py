@@ -16,21 +16,21 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import EFFECTS
+from avtorch.gap.engine.free_forms import band_products, gram
 from avtorch.gap.engine.joint import (
     NO_CHANGE,
     SIZES,
     Change,
     JointFit,
     JointModel,
-    gram,
     nats_of,
     noise_left,
     of_car,
     of_effect,
-    products,
 )
 from avtorch.gap.engine.likelihood import log_sum
 from avtorch.gap.engine.priors import EFFECT_NATS, TEMPER, UNKNOWN_NATS
+from avtorch.gap.engine.search import limit_starts, tried
 from avtorch.gap.engine.shape_error import effect_energy, relative_size, shape_log_odds
 
 Progress = Callable[[str, int, int], None]
@@ -39,8 +39,8 @@ MOST = 3
 """Changes at once."""
 _FITTED = 6  # effects besides lag, gain and dead time
 _STARTS = 2  # of an effect
+_LIMIT_STARTS = 4  # of a saturation, before the promising ones are chosen
 _HELD = 0.9  # probability that an alias set holds
-_CREEPS_BELOW = 3.0  # [m/s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +75,11 @@ class Visited:
 
 @dataclass(frozen=True, eq=False)
 class ChangePosterior:
-    """`steps`: sets from one car on, each with one change more than the last; `visited` all of them.
+    """`best`: the last set; `visited`: all, by their changes. `scatter` of each change in the best.
 
-    `best`: the last set. `scatter` of each change in it. `siblings`: what else was tried where a change entered, with
-    probabilities among them. `rejected`: the strongest change of the last step, which did not enter, its
-    scatter, and its log odds [nats] if it had none.
-    `unknown`: probability that free forms differ besides.
+    `siblings`: names of what else may have entered where a change did. `rejected`: the strongest change of the last
+    step, which did not enter, its scatter, and its log odds [nats] if it had none. `unknown`: probability that free
+    forms differ besides.
     """
 
     model: JointModel
@@ -93,11 +92,8 @@ class ChangePosterior:
 
     def probability(self, change: Change) -> float:
         """Of a change, over all visited sets."""
-        return self._share(lambda key: change.key in key)
-
-    def _share(self, holds: Callable[[frozenset[tuple[str, bool]]], bool]) -> float:
         whole = log_sum([v.log_weight for v in self.visited.values()])
-        own = [v.log_weight for key, v in self.visited.items() if holds(key)]
+        own = [v.log_weight for key, v in self.visited.items() if change.key in key]
         return math.exp(log_sum(own) - whole) if own else 0.0
 
 
@@ -106,15 +102,10 @@ def candidates(model: JointModel, effects: Collection[str]) -> list[Change]:
     car = ["T_L", "K_L"] + ["dead_time"] * ("dead_time" in model.base.effects)
     out = [of_car(name) for name in car]
     held = {c.name for c in out} | set(model.own_effects)
-    data = model.whole
-    for e in EFFECTS.values():
-        if (e.name not in effects and e.base not in effects) or e.name in NO_CHANGE or e.onset == "must":
+    for e in tried(model.base, effects):
+        if e.name in NO_CHANGE or e.onset == "must" or e.base in held:
             continue
-        if e.base in held or not e.needs <= set(data.channels):
-            continue
-        if e.name == "low_speed_creep" and (data.smooth_speed < _CREEPS_BELOW).mean() < 0.01:
-            continue
-        starts = e.starts or _limits(model)
+        starts = e.starts or tuple(limit_starts(model.base)[:_LIMIT_STARTS])
         out.append(of_effect(e, starts, less=False))
         if e.one_sided:
             out.append(of_effect(e, starts, less=True))
@@ -216,13 +207,6 @@ def _alike(each: list[Visited]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def _limits(model: JointModel) -> tuple[tuple[float, float], ...]:
-    """Starts of both limits of a saturation, from the largest commands (inverse, [s²/m])."""
-    u = model.base["K_L"] * model.whole.command
-    high, low = max(float(np.percentile(u, 99.9)), 0.05), min(float(np.percentile(u, 0.1)), -0.05)
-    return tuple((1 / (high * f), 1 / (-low * g)) for f, g in ((0.7, 1.3), (0.4, 1.3), (1.3, 0.7), (1.3, 0.4)))
-
-
 def _promising(model: JointModel, fit: JointFit, changes: list[Change]) -> list[Change]:
     """Those of the car, and the effects that promise most to first order, with their best starts."""
     found: list[tuple[float, Change, tuple[float, ...]]] = []
@@ -239,9 +223,9 @@ def _promising(model: JointModel, fit: JointFit, changes: list[Change]) -> list[
             signals.append(moved.response() - h.predicted)
         tried = np.array(signals)
         base = np.concatenate([fit.derivatives[after], model.columns[after]])
-        shared = gram(noise, products(h.data, base, tried))
-        gains = gram(noise, products(h.data, model.left(fit, h)[None], tried))[0]
-        sizes = np.array([gram(noise, products(h.data, x[None], x[None]))[0, 0] for x in tried])
+        shared = gram(noise, band_products(h.data, base, tried))
+        gains = gram(noise, band_products(h.data, model.left(fit, h)[None], tried))[0]
+        sizes = np.array([gram(noise, band_products(h.data, x[None], x[None]))[0, 0] for x in tried])
         sizes = sizes - np.einsum("ij,ij->j", shared, np.linalg.solve(fit.information, shared))
         for (change, start), gain, size in zip(own, gains, np.maximum(sizes, 0.0), strict=True):
             if gain <= 0 and EFFECTS[change.effect].one_sided:
@@ -284,7 +268,7 @@ def _own_forms(model: JointModel, fit: JointFit, acting: list[FloatArray]) -> fl
     signals = [
         np.concatenate([model.left(fit, h)[None], base, x]) for h, base, x in zip(fit.sides, bases, own, strict=True)
     ]
-    P = [products(h.data, x, x) for h, x in zip(fit.sides, signals, strict=True)]
+    P = [band_products(h.data, x, x) for h, x in zip(fit.sides, signals, strict=True)]
     n = len(fit.information)
     precision = fit.information - sum(
         gram(noise, p[..., 1 : n + 1, 1 : n + 1]) for noise, p in zip(fit.noise, P, strict=True)
