@@ -40,15 +40,8 @@ from avtorch.gap.engine.priors import (
     WITHIN_NATS,
 )
 from avtorch.gap.engine.search import Search
-from avtorch.gap.engine.shape_error import log_prior, relative_size, shape_likelihood, shape_log_odds
-from avtorch.gap.engine.slow_forces import (
-    SlowForces,
-    SlowOnset,
-    band_covariance,
-    pulling_lags,
-    slow_forces,
-    slow_onset,
-)
+from avtorch.gap.engine.shape_error import relative_size, shape_likelihood, shape_log_odds, shape_log_prior
+from avtorch.gap.engine.slow_forces import SlowForces, SlowOnset, pulling_lags, slow_forces, slow_onset
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
 _EXAMINED = 8  # hypotheses that are examined in full
@@ -156,14 +149,10 @@ class ModelAverage:
 def examined_sets(search: Search) -> list[Examined]:
     """The best visited sets, the base, and the best single effects, examined."""
     ranked = [h for h in search.visited.values() if _acts(h)]
-    ranked.sort(key=lambda h: -_ranking(h))
-    chosen = [h for h in ranked if _ranking(h) > _ranking(ranked[0]) - WITHIN_NATS][:_EXAMINED]
-    for h in [
-        search.visited[search.key(search.base)],
-        *[h for h in ranked if len(h.effects) == len(search.base.effects) + 1][:2],
-    ]:
-        if h not in chosen:
-            chosen.append(h)
+    ranked.sort(key=lambda h: -h.score)
+    chosen = [h for h in ranked if h.score > ranked[0].score - WITHIN_NATS][:_EXAMINED]
+    single = [h for h in ranked if len(h.effects) == len(search.base.effects) + 1]
+    chosen += [h for h in (search.visited[search.key(search.base)], *single[:2]) if h not in chosen]
     return [examine(h, search) for h in chosen]
 
 
@@ -292,10 +281,6 @@ def _given(label: str, prior: Mapping[str, float]) -> float:
     return sum(math.log(max(x, 1e-300)) for x in weights)
 
 
-def _ranking(h: Hypothesis) -> float:
-    return h.score
-
-
 def _acts(h: Hypothesis) -> bool:
     """Whether no effect of the set stands at nothing."""
     return all(EFFECTS[e].size(h.values, h.neutral) > 0.1 for e in h.effects)
@@ -316,7 +301,7 @@ def _composed(
     """Slow forces beside a free form that has left `residual`, at every error of the effects' shape."""
     data = h.data
     shape = h.shape if residual is h.residual else shape_likelihood(data, residual, h.effect_energy)
-    logs = np.zeros(1) if shape is None else shape.nats + log_prior(h.effects)
+    logs = np.zeros(1) if shape is None else shape.nats + shape_log_prior(h.effects)
     over = nats + log_sum(logs) - log_sum(h.shape_log)
     if form and (over < least or (form == "tone" and nats < 2)):
         return None
@@ -325,9 +310,7 @@ def _composed(
     for k, value in enumerate(logs):
         if value < logs.max() - 6:
             continue
-        given = band_covariance(data, residual)
-        if shape is not None:
-            given = np.ascontiguousarray(shape.covariances[k]), shape.counts[k]
+        given = None if shape is None else (np.ascontiguousarray(shape.covariances[k]), shape.counts[k])
         found = slow_forces(data, residual, _from_the_start(h), given=given, lags=lags)
         free = -0.5 * float((found.counts * (np.linalg.slogdet(found.covariance)[1] + data.channel_count)).sum())
         total = exact + nats + float(value) + found.log_likelihood - free

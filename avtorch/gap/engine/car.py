@@ -2,43 +2,27 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import fields
-from typing import Any, Protocol, Self
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name, neutral_values
-from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.simulator.simulator_input import SimulatorInput
 
-
-class Car(Protocol):
-    """What a `Hypothesis` has that a plant is made of."""
-
-    data: DriveData
-    values: FloatArray
-    effects: list[str]
-    onsets: dict[str, float]
-    shift_speeds: FloatArray
-    lost: tuple[tuple[int, int], ...]
-    baseline: GapPlant | None
-
-    def __getitem__(self, name: str) -> float: ...
-    def onset_vector(self) -> FloatArray: ...
-    def command(self) -> FloatArray: ...
-    def copy(self) -> Self: ...
-    def without(self, effect: str) -> Self: ...
+if TYPE_CHECKING:
+    from avtorch.gap.engine.hypothesis import Hypothesis
 
 
-def effect_values(h: Car, effect: str) -> dict[str, Any]:
+def effect_values(h: Hypothesis, effect: str) -> dict[str, Any]:
     """Fields of the table's effect (keys of `Effect.of`) at the hypothesis's values; times from the first log's
     start."""
     own = EFFECTS[effect]
@@ -58,13 +42,13 @@ def effect_values(h: Car, effect: str) -> dict[str, Any]:
     return out
 
 
-def table_effect(h: Car, effect: str) -> Effect:
+def table_effect(h: Hypothesis, effect: str) -> Effect:
     """The table's effect at the hypothesis's values."""
     kind, given = EFFECTS[effect].kind or TABLE[base_name(effect)], effect_values(h, effect)
     return kind(**{f.name: given[f.name] for f in fields(kind) if f.name in given})
 
 
-def plant_of(h: Car, baseline: GapPlant | None = None) -> GapPlant:
+def plant_of(h: Hypothesis, baseline: GapPlant | None = None) -> GapPlant:
     """The repaired simulator: the baseline's effects, those of the hypothesis, its lag and gain. What sets in later
     acts from the start, but for a change of the gain."""
     own = [table_effect(h, e) for e in h.effects if not e.startswith("~")]
@@ -97,7 +81,9 @@ def neutral_of(baseline: GapPlant) -> FloatArray:
     return out
 
 
-def simulator_signals(h: Car, values: FloatArray, onsets: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+def simulator_signals(
+    h: Hypothesis, values: FloatArray, onsets: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """What `Hypothesis.on_grid` returns, by the simulator itself, which also has a user's own effects.
 
     An effect that sets in during the drive is spliced: its response from then on, the other one's before.
@@ -125,21 +111,18 @@ def simulator_signals(h: Car, values: FloatArray, onsets: FloatArray | None = No
     return accel, gained
 
 
-def _signals(h: Car) -> tuple[FloatArray, FloatArray]:
-    grid, car = h.data.grid, plant_of(h, h.baseline)
-    command, speed = h.command()[grid.row], h.data.speed is not None
-    starts = np.append(np.flatnonzero(grid.starts), len(grid.time)).tolist()
-    accel, gained = np.empty(len(grid.time)), np.empty(len(grid.time))
-    for i, j in itertools.pairwise(starts):
-        drive = SimulatorInput(
-            torch.as_tensor(grid.time[i:j]),
-            torch.as_tensor(command[i:j]),
-            torch.as_tensor(grid.speed[i:j]) if speed else None,
-            float(grid.accel0[i]),
-            h.data.accel_kind == "specific-force",
-        )
-        with torch.inference_mode():
-            response = car.response(drive)
-        accel[i:j] = response.accel_measured.numpy()
-        gained[i:j] = (response.speed_measured - response.speed_measured[0]).numpy()
-    return accel, gained
+def _signals(h: Hypothesis) -> tuple[FloatArray, FloatArray]:
+    car = plant_of(h, h.baseline)
+    with torch.inference_mode():
+        responses = [car.response(drive) for drive in drives_of(h)]
+    gained = [r.speed_measured - r.speed_measured[0] for r in responses]
+    return torch.cat([r.accel_measured for r in responses]).numpy(), torch.cat(gained).numpy()
+
+
+def drives_of(h: Hypothesis) -> Iterator[SimulatorInput]:
+    """The stretches of a hypothesis's drives as the simulator's inputs, on the grid."""
+    grid, command = h.data.grid, h.command()[h.data.grid.row]
+    for i, j in pairwise([*np.flatnonzero(grid.starts).tolist(), len(grid.time)]):
+        speed = None if h.data.speed is None else torch.as_tensor(grid.speed[i:j])
+        time, sent = torch.as_tensor(grid.time[i:j]), torch.as_tensor(command[i:j])
+        yield SimulatorInput(time, sent, speed, float(grid.accel0[i]), h.data.accel_kind == "specific-force")

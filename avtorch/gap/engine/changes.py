@@ -16,6 +16,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import EFFECTS
+from avtorch.gap.engine.free_forms import band_products, gram
 from avtorch.gap.engine.joint import (
     NO_CHANGE,
     SIZES,
@@ -23,16 +24,15 @@ from avtorch.gap.engine.joint import (
     JointFit,
     JointModel,
     Side,
-    gram,
     nats_of,
     noise_left,
     of_car,
     of_effect,
     of_growth,
-    products,
 )
 from avtorch.gap.engine.likelihood import log_sum
 from avtorch.gap.engine.priors import EFFECT_NATS, TEMPER, UNKNOWN_NATS
+from avtorch.gap.engine.search import limit_starts, tried
 from avtorch.gap.engine.shape_error import effect_energy, relative_size, shape_log_odds
 
 Progress = Callable[[str, int, int], None]
@@ -43,7 +43,6 @@ MOST = 3
 _FITTED = 6  # effects besides lag, gain and dead time
 _STARTS = 2  # of an effect
 _HELD = 0.9  # probability that an alias set holds
-_CREEPS_BELOW = 3.0  # [m/s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +77,11 @@ class Visited:
 
 @dataclass(frozen=True, eq=False)
 class ChangePosterior:
-    """`steps`: sets from one car on, each with one change more than the last; `visited` all of them.
+    """`best`: the last set; `visited`: all, by their changes. `scatter` of each change in the best.
 
-    `best`: the last set. `scatter` of each change in it. `siblings`: what else was tried where a change entered, with
-    probabilities among them. `rejected`: the strongest change of the last step, which did not enter, its
-    scatter, and its log odds [nats] if it had none.
-    `unknown`: probability that free forms differ besides.
+    `siblings`: names of what else may have entered where a change did. `rejected`: the strongest change of the last
+    step, which did not enter, its scatter, and its log odds [nats] if it had none. `unknown`: probability that free
+    forms differ besides.
     """
 
     model: JointModel
@@ -113,15 +111,10 @@ def candidates(model: JointModel, effects: Collection[str]) -> list[Change]:
     car = ["T_L", "K_L"] + ["dead_time"] * ("dead_time" in model.base.effects)
     out = [of_car(name) for name in car]
     held = {c.name for c in out} | set(model.own_effects)
-    data = model.whole
-    for e in EFFECTS.values():
-        if (e.name not in effects and e.base not in effects) or e.name in NO_CHANGE or e.onset == "must":
+    for e in tried(model.base, effects):
+        if e.name in NO_CHANGE or e.onset == "must" or e.base in held:
             continue
-        if e.base in held or not e.needs <= set(data.channels):
-            continue
-        if e.name == "low_speed_creep" and (data.smooth_speed < _CREEPS_BELOW).mean() < 0.01:
-            continue
-        starts = e.starts or _limits(model)
+        starts = e.starts or tuple(limit_starts(model.base))
         out += [of_effect(e, starts, "after"), of_effect(e, starts, "both")]
         if e.one_sided:
             out.append(of_effect(e, starts, "before"))
@@ -238,13 +231,6 @@ def _alike(each: list[Visited]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def _limits(model: JointModel) -> tuple[tuple[float, float], ...]:
-    """Starts of both limits of a saturation, from the largest commands (inverse, [s²/m])."""
-    u = model.base["K_L"] * model.whole.command
-    high, low = max(float(np.percentile(u, 99.9)), 0.05), min(float(np.percentile(u, 0.1)), -0.05)
-    return tuple((1 / (high * f), 1 / (-low * g)) for f, g in ((0.7, 1.3), (0.4, 1.3), (1.3, 0.7), (1.3, 0.4)))
-
-
 def _promising(model: JointModel, fit: JointFit, changes: list[Change]) -> list[Change]:
     """Those of the car, and the effects that promise most to first order, with their best starts."""
     own = [(c, s) for c in changes if c.effect for s in c.starts]
@@ -262,9 +248,9 @@ def _promising(model: JointModel, fit: JointFit, changes: list[Change]) -> list[
             signals.append(moved.response() - h.predicted)
         tried = np.array(signals)
         base = np.concatenate([fit.derivatives[after], model.columns[after]])
-        crossed[:, at] += gram(noise, products(h.data, base, tried))
-        gains[at] += gram(noise, products(h.data, model.left(fit, h)[None], tried))[0]
-        sizes[at] += [gram(noise, products(h.data, x[None], x[None]))[0, 0] for x in tried]
+        crossed[:, at] += gram(noise, band_products(h.data, base, tried))
+        gains[at] += gram(noise, band_products(h.data, model.left(fit, h)[None], tried))[0]
+        sizes[at] += [gram(noise, band_products(h.data, x[None], x[None]))[0, 0] for x in tried]
     sizes = np.maximum(sizes - np.einsum("ij,ij->j", crossed, np.linalg.solve(fit.information, crossed)), 0.0)
     starts: dict[Change, list[tuple[float, ...]]] = {}
     for k in np.argsort(-0.5 * gains**2 / (sizes + 1)):
@@ -304,7 +290,7 @@ def _own_forms(model: JointModel, fit: JointFit, acting: list[FloatArray]) -> fl
     signals = [
         np.concatenate([model.left(fit, h)[None], base, x]) for h, base, x in zip(fit.sides, bases, own, strict=True)
     ]
-    P = [products(h.data, x, x) for h, x in zip(fit.sides, signals, strict=True)]
+    P = [band_products(h.data, x, x) for h, x in zip(fit.sides, signals, strict=True)]
     n = len(fit.information)
     precision = fit.information - sum(
         gram(noise, p[..., 1 : n + 1, 1 : n + 1]) for noise, p in zip(fit.noise, P, strict=True)

@@ -51,7 +51,7 @@ _COUNT = len(NEUTRAL)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def modes(square: float, T: float, h: float) -> tuple[float, float, float, float]:  # pragma: no cover - compiled
+def modes(square: float, T: float, h: float) -> tuple[float, float, float, float]:
     """Transition over `h` of (a - g, tau² a'), `square` = tau² (see `simulator.actuator.modes_over`)."""
     bend = T * T - 4.0 * square
     safe = max(square, 1e-12)
@@ -73,14 +73,14 @@ def modes(square: float, T: float, h: float) -> tuple[float, float, float, float
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _risen(since: float, ramp: float) -> float:  # pragma: no cover - compiled
+def _risen(since: float, ramp: float) -> float:
     """Integral of a rise over `ramp` [s], `since` [s] its begin (see `effects.gain_change`)."""
     within = min(max(since, 0.0), ramp)
     return within * within / (2.0 * ramp) + max(since - ramp, 0.0)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _commands(  # pragma: no cover - compiled
+def _commands(
     p: FloatArray, acts: FloatArray, time: FloatArray, command: FloatArray, starts: BoolArray, out: FloatArray
 ) -> None:
     """Commands behind saturation, dead band, play and hand-over; `out` (grid,)."""
@@ -113,7 +113,7 @@ def _commands(  # pragma: no cover - compiled
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def simulate(  # pragma: no cover - compiled
+def simulate(
     p: FloatArray,
     acts: FloatArray,
     time: FloatArray,
@@ -324,9 +324,7 @@ def simulate(  # pragma: no cover - compiled
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def read_late(  # pragma: no cover - compiled
-    rows: FloatArray, time: FloatArray, values: FloatArray, delay: float, out: FloatArray
-) -> None:
+def read_late(rows: FloatArray, time: FloatArray, values: FloatArray, delay: float, out: FloatArray) -> None:
     """`values` (grid,) of `time` read at `rows - delay` (row,), linear between grid points and held at the ends."""
     k, last = 0, len(time) - 1
     for i in range(len(rows)):

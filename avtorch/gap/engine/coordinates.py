@@ -166,169 +166,89 @@ def _lasting(name: str, effect: str, parameter: str) -> Coordinate:
 
 
 _SPEED, _ACCEL, _BOTH = frozenset({"speed"}), frozenset({"accel"}), frozenset({"accel", "speed"})
-_RING = tuple((0.3, f) for f in (1.0, 1.25, 1.6, 2.0, 2.5, 3.0, 3.6, 4.4))
 
-_square = Coordinate(
+
+def _one(
+    effect: str,
+    parameter: str,
+    limits: tuple[float, float],
+    starts: tuple[float, ...],
+    *,
+    name: str = "",
+    link: Link = "value",
+    needs: frozenset[str] = frozenset(),
+) -> EngineEffect:
+    """An effect of one coordinate, which has the effect's name where no other is given."""
+    coordinate = _sized(name or effect, effect, parameter, link, *limits)
+    return EngineEffect(effect, (coordinate,), tuple((x,) for x in starts), "may", needs)
+
+
+_SQUARE = Coordinate(
     "square_period", "inverse_frequency_s", "square", 0.0, 4.0, SCALE_OF_RANGE / 9, FAINT_OF_RANGE / 12**2
 )
+_SATURATION = (
+    _sized("drive_limit", "saturation", "accel_max_mps2", "inverse", 0, 12),
+    _sized("brake_limit", "saturation", "accel_min_mps2", "inverse", 0, 12, sign=-1),
+)
+_ASYMMETRY = (
+    _sized("log_brake_gain", "brake_throttle_asymmetry", "brake_gain_ratio", "log", -2, 1.6),
+    _sized("log_brake_lag", "brake_throttle_asymmetry", "brake_lag_ratio", "log", -1.5, 2.3),
+)
+_RATE_LIMIT = (
+    _sized("inverse_jerk", "rate_limit", "jerk_max_mps3", "inverse", 0, 12),
+    _nuisance("log_fall", "fall_ratio", 0.0, 0.7, -2.5, 2.5, "log"),
+)
+_GAIN_CHANGE = (
+    _sized("gain_step", "gain_change", "gain_ratio", "less one", -0.9, 4),
+    _lasting("gain_ramp", "gain_change", "ramp_s"),
+)
+_GEAR_SHIFT = (
+    Coordinate("shift_depth", "depth", "value", 0, 1, 0.6 * 0.95, FAINT_OF_RANGE * 0.3),
+    _nuisance("shift_duration", "duration_s", 0.35, 0.2, 0.06, 2.5),
+)
+_RING = (
+    # a ring follows a step in its direction; the other sign would be one more lag
+    Coordinate("ring_amplitude", "amplitude", "value", 0, 8, 0.3, FAINT_OF_RANGE * 0.5 / 3),
+    _nuisance("ring_frequency", "frequency_hz", 2.5, 1.2, 0.8, 5.5),
+)
+_RING_STARTS = tuple((0.3, f) for f in (1.0, 1.25, 1.6, 2.0, 2.5, 3.0, 3.6, 4.4))
+_LINEAR = (
+    _nuisance("free_pole", "", 0.0, 0.3, -3.0, 0.0),
+    _nuisance("free_frequency", "", 1.8, 0.8, 0.6, 3.5),
+)
+_DRAG = (
+    _sized("drag", "aerodynamic_drag", "drag_per_m", "value", 0, 0.05),
+    _nuisance("wind", "wind_mps", 0.0, 3.0, -12.0, 12.0),
+)
+_LATE_ACTUATOR = (_SQUARE, Coordinate("log_lag_ratio", "lag_ratio", "log", -2.5, 2.0, 0.7))
 
 EFFECTS: dict[str, EngineEffect] = {
     e.name: e
     for e in (
-        EngineEffect(
-            "dead_time",
-            (_sized("dead_time", "dead_time", "delay_s", "value", 0, 1.5),),
-            ((0.06,), (0.2,), (0.4,), (0.8,)),
-        ),
-        EngineEffect(
-            "dead_band",
-            (_sized("dead_band", "dead_band", "half_width_mps2", "value", 0, 1.5),),
-            ((0.05,), (0.2,), (0.5,)),
-        ),
-        EngineEffect(
-            "backlash", (_sized("backlash", "backlash", "half_width_mps2", "value", 0, 1.5),), ((0.05,), (0.2,), (0.5,))
-        ),
-        EngineEffect(
-            "hand_over", (_sized("hand_over", "hand_over", "pause_s", "value", 0, 2),), ((0.1,), (0.3,), (0.8,))
-        ),
-        EngineEffect(
-            "saturation",
-            (
-                _sized("drive_limit", "saturation", "accel_max_mps2", "inverse", 0, 12),
-                _sized("brake_limit", "saturation", "accel_min_mps2", "inverse", 0, 12, sign=-1),
-            ),
-            (),  # quantiles of the command, see `search`
-        ),
-        EngineEffect(
-            "brake_throttle_asymmetry",
-            (
-                _sized("log_brake_gain", "brake_throttle_asymmetry", "brake_gain_ratio", "log", -2, 1.6),
-                _sized("log_brake_lag", "brake_throttle_asymmetry", "brake_lag_ratio", "log", -1.5, 2.3),
-            ),
-            ((-0.3, 0.0), (0.0, 0.6), (-0.3, 0.6), (0.3, 0.5)),
-        ),
-        EngineEffect("second_order_actuator", (_square,), ((0.01,), (0.04,), (0.1,), (0.7,)), "never"),
-        EngineEffect(
-            "second_order_actuator@late",
-            (_square, Coordinate("log_lag_ratio", "lag_ratio", "log", -2.5, 2.0, 0.7)),
-            ((0.02, -0.3), (0.1, -1.0), (0.7, 0.0)),
-            "must",
-        ),
-        EngineEffect(
-            "rate_limit",
-            (
-                _sized("inverse_jerk", "rate_limit", "jerk_max_mps3", "inverse", 0, 12),
-                _nuisance("log_fall", "fall_ratio", 0.0, 0.7, -2.5, 2.5, "log"),
-            ),
-            ((0.4, 0.0), (1.0, 0.0), (2.5, 0.0)),
-        ),
-        EngineEffect(
-            "speed_dependent_lag",
-            (_sized("lag_slope", "speed_dependent_lag", "lag_slope", "value", -2.5, 2.5),),
-            ((0.3,), (-0.3,), (-0.8,), (0.8,)),
-            "may",
-            _SPEED,
-        ),
-        EngineEffect(
-            "speed_dependent_gain",
-            (_sized("gain_slope", "speed_dependent_gain", "gain_slope", "value", -2, 2),),
-            ((0.2,), (-0.2,)),
-            "may",
-            _SPEED,
-        ),
-        EngineEffect(
-            "gain_change",
-            (
-                _sized("gain_step", "gain_change", "gain_ratio", "less one", -0.9, 4),
-                _lasting("gain_ramp", "gain_change", "ramp_s"),
-            ),
-            ((0.2, 0.0),),
-            "must",
-        ),
-        EngineEffect(
-            "gear_shift",
-            (
-                Coordinate("shift_depth", "depth", "value", 0, 1, 0.6 * 0.95, FAINT_OF_RANGE * 0.3),
-                _nuisance("shift_duration", "duration_s", 0.35, 0.2, 0.06, 2.5),
-            ),
-            ((0.6, 0.35), (0.9, 0.7)),
-            "may",
-            _SPEED,
-        ),
-        EngineEffect(
-            "driveline_oscillation",
-            (
-                # a ring follows a step in its direction; the other sign would be one more lag
-                Coordinate("ring_amplitude", "amplitude", "value", 0, 8, 0.3, FAINT_OF_RANGE * 0.5 / 3),
-                _nuisance("ring_frequency", "frequency_hz", 2.5, 1.2, 0.8, 5.5),
-            ),
-            _RING,
-            "may",
-            _BOTH,
-        ),
-        EngineEffect(
-            "~linear",
-            (
-                _nuisance("free_pole", "", 0.0, 0.3, -3.0, 0.0),
-                _nuisance("free_frequency", "", 1.8, 0.8, 0.6, 3.5),
-            ),
-            ((-0.2, 1.0), (-0.2, 1.8), (-0.8, 1.8), (-0.2, 2.8)),
-            "never",
-        ),
+        _one("dead_time", "delay_s", (0, 1.5), (0.06, 0.2, 0.4, 0.8)),
+        _one("dead_band", "half_width_mps2", (0, 1.5), (0.05, 0.2, 0.5)),
+        _one("backlash", "half_width_mps2", (0, 1.5), (0.05, 0.2, 0.5)),
+        _one("hand_over", "pause_s", (0, 2), (0.1, 0.3, 0.8)),
+        EngineEffect("saturation", _SATURATION, ()),  # starts are quantiles of the command, see `search`
+        EngineEffect("brake_throttle_asymmetry", _ASYMMETRY, ((-0.3, 0.0), (0.0, 0.6), (-0.3, 0.6), (0.3, 0.5))),
+        EngineEffect("second_order_actuator", (_SQUARE,), ((0.01,), (0.04,), (0.1,), (0.7,)), "never"),
+        EngineEffect("second_order_actuator@late", _LATE_ACTUATOR, ((0.02, -0.3), (0.1, -1.0), (0.7, 0.0)), "must"),
+        EngineEffect("rate_limit", _RATE_LIMIT, ((0.4, 0.0), (1.0, 0.0), (2.5, 0.0))),
+        _one("speed_dependent_lag", "lag_slope", (-2.5, 2.5), (0.3, -0.3, -0.8, 0.8), name="lag_slope", needs=_SPEED),
+        _one("speed_dependent_gain", "gain_slope", (-2, 2), (0.2, -0.2), name="gain_slope", needs=_SPEED),
+        EngineEffect("gain_change", _GAIN_CHANGE, ((0.2, 0.0),), "must"),
+        EngineEffect("gear_shift", _GEAR_SHIFT, ((0.6, 0.35), (0.9, 0.7)), "may", _SPEED),
+        EngineEffect("driveline_oscillation", _RING, _RING_STARTS, "may", _BOTH),
+        EngineEffect("~linear", _LINEAR, ((-0.2, 1.0), (-0.2, 1.8), (-0.8, 1.8), (-0.2, 2.8)), "never"),
         EngineEffect("command_hold", (), ((),), "never"),
-        EngineEffect(
-            "aerodynamic_drag",
-            (
-                _sized("drag", "aerodynamic_drag", "drag_per_m", "value", 0, 0.05),
-                _nuisance("wind", "wind_mps", 0.0, 3.0, -12.0, 12.0),
-            ),
-            ((4e-4, 0.0), (4e-4, 5.0)),
-            "may",
-            _SPEED,
-        ),
-        EngineEffect(
-            "viscous_drag",
-            (_sized("viscous", "viscous_drag", "drag_per_s", "value", 0, 2),),
-            ((0.012,),),
-            "may",
-            _SPEED,
-        ),
-        EngineEffect(
-            "constant_resistance",
-            (_sized("resistance", "constant_resistance", "resistance_mps2", "value", 0, 4),),
-            ((0.1,),),
-        ),
-        EngineEffect(
-            "low_speed_creep",
-            (_sized("creep", "low_speed_creep", "creep_mps2", "value", 0, 3),),
-            ((0.3,),),
-            "may",
-            _SPEED,
-        ),
-        EngineEffect(
-            "sensor_lag",
-            (_sized("sensor_lag", "sensor_lag", "lag_s", "value", 0, 6),),
-            ((0.1,), (0.3,)),
-            "may",
-            _ACCEL,
-        ),
-        EngineEffect(
-            "sensor_bias",
-            (_sized("sensor_bias", "sensor_bias", "bias_mps2", "value", -4, 4),),
-            ((0.1,),),
-            "may",
-            _ACCEL,
-        ),
-        EngineEffect(
-            "sensor_scale",
-            (_sized("sensor_scale", "sensor_scale", "scale", "less one", -0.7, 1.5),),
-            ((0.1,),),
-            "may",
-            _BOTH,
-        ),
-        EngineEffect(
-            "speed_lag", (_sized("speed_lag", "speed_lag", "lag_s", "value", 0, 6),), ((0.2,), (0.5,)), "may", _BOTH
-        ),
+        EngineEffect("aerodynamic_drag", _DRAG, ((4e-4, 0.0), (4e-4, 5.0)), "may", _SPEED),
+        _one("viscous_drag", "drag_per_s", (0, 2), (0.012,), name="viscous", needs=_SPEED),
+        _one("constant_resistance", "resistance_mps2", (0, 4), (0.1,), name="resistance"),
+        _one("low_speed_creep", "creep_mps2", (0, 3), (0.3,), name="creep", needs=_SPEED),
+        _one("sensor_lag", "lag_s", (0, 6), (0.1, 0.3), needs=_ACCEL),
+        _one("sensor_bias", "bias_mps2", (-4, 4), (0.1,), needs=_ACCEL),
+        _one("sensor_scale", "scale", (-0.7, 1.5), (0.1,), link="less one", needs=_BOTH),
+        _one("speed_lag", "lag_s", (0, 6), (0.2, 0.5), needs=_BOTH),
     )
 }
 """The effects that the search tries, in the chain's order; what chance decides (gust, road, outliers) is not a plant's.

@@ -151,7 +151,7 @@ def response_rows(h: Hypothesis) -> int:
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def take_out(  # pragma: no cover - compiled
+def take_out(
     score: FloatArray, information: FloatArray, cover: FloatArray, pulse: FloatArray, first: int, sign: float
 ) -> None:
     """`score` -= sign D A D w for a `pulse` w that begins in row `first`: the score beside that pulse, in place.

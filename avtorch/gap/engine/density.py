@@ -3,7 +3,7 @@ r"""The posterior density of a hypothesis's coordinates, differentiable: sampler
     log p(x | log) = temper log L(x) + log p(x) + const,    log L = -1/2 sum_b n_b log det E_b(x)
 
 x are the coordinates that a fit moves (`Hypothesis.free`), the recorder's among them; L is that of `likelihood`, of the
-torch plant behind the recorder, and p(x) that of `evidence.log_prior_density`, the non-local prior of sizes included.
+torch plant behind the recorder, and p(x) is `evidence.log_prior`, with the non-local prior of sizes.
 `temper` is the model average's. Tests hold the value to the compiled one and the gradient to differences.
 
 Coordinates have limits. Samplers walk in z, which has none; the Jacobian is part of their density:
@@ -17,10 +17,10 @@ here; its z is the channel's lateness, delay plus filter, which a log knows far 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -28,10 +28,9 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid, one_hot, softplus
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.engine.coordinates import COORDINATES, EFFECTS, INDEX
+from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.evidence import _BASE_SD, _HALF_LOG_2PI, _IMPOSSIBLE, _STUDENT_3, log_prior_density
-from avtorch.gap.engine.gauss_newton import normal_prior
+from avtorch.gap.engine.evidence import log_prior
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import _LEAST
 from avtorch.gap.engine.priors import TEMPER
@@ -85,8 +84,8 @@ class HypothesisDensity:
         for k, own in enumerate(x):
             h.values[at] = own
             h.evaluate()
-            out[k] = self.temper * h.log_likelihood + log_prior_density(h)
-        return out
+            out[k] = h.log_likelihood
+        return self.temper * out + log_prior(h, self.names, torch.as_tensor(x)).numpy()
 
     # as a density of z ------------------------------------------------------------------------------------------------
     def initial(self) -> Tensor:
@@ -211,51 +210,15 @@ def of_products(data: DriveData, products: Tensor) -> Tensor:
     return -0.5 * (size * det.log()).sum(-1)
 
 
-def log_prior(h: Hypothesis, names: Sequence[str], x: Tensor) -> Tensor:
-    """`evidence.log_prior_density` (...) with coordinates `names` at `x` (..., coordinate), others at their values."""
-    own = {n: torch.as_tensor(h[n], dtype=x.dtype) for n in h.free} | dict(zip(names, x.unbind(-1), strict=True))
-    total = torch.zeros_like(x[..., 0])
-    for name, at in own.items():
-        mean, scale = normal_prior(name, h.neutral[INDEX[name]])
-        if name == "T_L":
-            z = (at.log() - mean) / _BASE_SD[name]
-            total = total - 0.5 * z * z - at.log() - math.log(_BASE_SD[name]) - _HALF_LOG_2PI
-        elif name == "K_L":
-            total = total + _student((at - mean) / _BASE_SD[name]) - math.log(_BASE_SD[name])
-        elif name in COORDINATES and COORDINATES[name].mean is None:
-            c = COORDINATES[name]
-            sides = 0.0 if c.signed else math.log(2)
-            total = total + _student((at - mean) / c.scale) - math.log(c.scale) + sides
-        else:
-            total = total - 0.5 * ((at - mean) / scale) ** 2 - math.log(scale) - _HALF_LOG_2PI
-    for effect in h.effects:
-        sized = [(own[c.name] - h.neutral[INDEX[c.name]]) / c.faint for c in EFFECTS[effect].coordinates if c.faint]
-        if sized:
-            square = sum(z * z for z in sized)
-            total = total + (-1 / torch.as_tensor(square).clamp_min(1e-9)).clamp_min(_IMPOSSIBLE)
-    return total
-
-
 def _softplus(x: Tensor) -> Tensor:
     return softplus(x, threshold=40.0)  # linear only where doubles cannot tell
-
-
-def _student(z: Tensor) -> Tensor:
-    return _STUDENT_3 - 2 * torch.log1p(z * z / 3)
-
-
-class Scored(Protocol):
-    """A density that gives its value without, and with, its gradient."""
-
-    def value(self, z: Tensor) -> Tensor: ...
-    def expand(self, z: Tensor) -> tuple[Tensor, Tensor]: ...
 
 
 class WithScore(torch.autograd.Function):
     """A log density whose gradient is kept from the forward pass."""
 
     @staticmethod
-    def forward(ctx: Any, z: Tensor, density: Scored) -> Tensor:
+    def forward(ctx: Any, z: Tensor, density: Any) -> Tensor:
         if not ctx.needs_input_grad[0]:
             return density.value(z)
         value, score = density.expand(z)

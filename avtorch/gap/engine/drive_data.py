@@ -8,10 +8,9 @@ Channels are the acceleration [m/s²] and the differenced speed [m/s²]; both ke
 
 from __future__ import annotations
 
-import copy
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -68,7 +67,7 @@ class DriveData:
     `band_of_bin` (bin,); `band_size` (band,) coefficients per channel.
     `hold`: rows for which the recorder holds a speed, from the count `hold_phase` on. `align_s` [s]: delay of the
     accelerometer in the coefficients, by which both channels are in phase. `raw_accel`: as read, where outliers
-    were replaced.
+    were replaced. `reference_speed` [m/s]: at which slopes with speed are neutral.
     `cache`: tables derived from the shape alone.
     """
 
@@ -90,6 +89,7 @@ class DriveData:
     hold_phase: int = 0
     align_s: float = 0.0
     raw_accel: FloatArray | None = None
+    reference_speed: float = 15.0
     cache: dict[str, Any] = field(default_factory=dict)
     # of the transform, see `_frame`
     warm_rows: int = 0
@@ -174,6 +174,8 @@ class DriveData:
             group=group,
             accel_kind=each[0].accel_kind,
         )
+        # the mean while moving, as the effects' files have it
+        data.reference_speed = max(float(data.smooth_speed.mean()), 1e-3)
         data.position = data._positions()
         data.hold, data.hold_phase = data._find_hold()
         data._frame()
@@ -219,11 +221,6 @@ class DriveData:
         return out
 
     @property
-    def reference_speed(self) -> float:
-        """At which slopes with speed are neutral [m/s]: the mean while moving, as the effects' files have it."""
-        return max(float(self.smooth_speed.mean()), 1e-3)
-
-    @property
     def window(self) -> FloatArray:
         if "window" not in self.cache:
             M = self.frame_rows
@@ -262,30 +259,48 @@ class DriveData:
 
     def below(self, fmax: float) -> DriveData:
         """The same drives, of which bands that begin below `fmax` [Hz] count."""
-        k = max(int(np.searchsorted(self.frequency[self.band_edges[:-1]], fmax)), 1)
-        return self._with_bins(self.band_edges[: k + 1])
+        edges = self.band_edges[: max(int(np.searchsorted(self.frequency[self.band_edges[:-1]], fmax)), 1) + 1]
+        bins = int(edges[-1])
+        measured = np.ascontiguousarray(self.measured[:, :, :bins])
+        return replace(
+            self, band_edges=edges, frequency=self.frequency[:bins], measured=measured, cache=self._tables_of_rows()
+        )
 
     def only(self, frames: BoolArray) -> DriveData:
         """The same drives, of which only these `frames` (frame,) count."""
-        other = copy.copy(self)
-        other.cache = {k: v for k, v in self.cache.items() if k in ("grid", "window", "rate")}
-        other.used = self.used.copy()
-        other.used[self.used] = frames
-        other.frame_time, other.measured = self.frame_time[frames], self.measured[:, frames]
-        return other
+        used = self.used.copy()
+        used[self.used] = frames
+        measured = self.measured[:, frames]
+        return replace(
+            self, used=used, frame_time=self.frame_time[frames], measured=measured, cache=self._tables_of_rows()
+        )
+
+    def part(self, rows: BoolArray) -> DriveData:
+        """The stretches at `rows` (row,), which are successive; slopes stay neutral at the speed of all drives."""
+        first, last = int(np.argmax(rows)), len(rows) - int(np.argmax(rows[::-1]))
+        frame_rows = np.concatenate([np.full(n, first <= i < last) for i, n in self.frames])
+        by_row = ("time", "stamp", "log", "source", "count", "command", "accel", "speed", "smooth_speed", "position")
+        cut = {name: getattr(self, name) for name in (*by_row, "raw_accel")}
+        return replace(
+            self,
+            **{name: None if x is None else x[first:last] for name, x in cut.items()},
+            bounds=self.bounds[(self.bounds >= first) & (self.bounds <= last)] - first,
+            frames=[(i - first, n) for i, n in self.frames if first <= i < last],
+            used=self.used[frame_rows],
+            frame_time=self.frame_time[frame_rows[self.used]],
+            measured=self.measured[:, frame_rows[self.used]],
+            cache={},
+        )
 
     def with_accel(self, accel: FloatArray) -> DriveData:
         """The same drives with other readings of the accelerometer (row,); those as read stay in `raw_accel`."""
-        other = copy.copy(self)
-        other.raw_accel = self.accel if self.raw_accel is None else self.raw_accel
-        other.accel = accel
+        other = replace(self, raw_accel=self.accel if self.raw_accel is None else self.raw_accel, accel=accel)
         other.measured = other._measured()
         return other
 
     def with_align(self, align_s: float) -> DriveData:
         """The same drives with the accelerometer, measured and simulated alike, this much later [s]."""
-        other = copy.copy(self)
-        other.align_s = align_s
+        other = replace(self, align_s=align_s)
         other.measured = other._measured()
         return other
 
@@ -355,13 +370,9 @@ class DriveData:
             self.cache[name] = below, at - below
         return _read(np.ascontiguousarray(x), *self.cache[name])
 
-    def _with_bins(self, edges: IntArray) -> DriveData:
-        other = copy.copy(self)
-        other.cache = {k: v for k, v in self.cache.items() if k in ("grid", "window", "rate")}
-        other.band_edges = edges
-        other.frequency = np.asarray(self.frequency[: int(edges[-1])], np.float64)
-        other.measured = np.ascontiguousarray(self.measured[:, :, : edges[-1]])
-        return other
+    def _tables_of_rows(self) -> dict[str, Any]:
+        """The cached tables that do not depend on frames and bins."""
+        return {k: v for k, v in self.cache.items() if k in ("grid", "window", "rate")}
 
     def _frame(self) -> None:
         """Cut stretches into frames and bins into bands."""
@@ -470,7 +481,7 @@ def _dct4(x: FloatArray) -> FloatArray:
 
 
 @njit(cache=True, error_model="numpy")
-def _fold(x: FloatArray, begins: IntArray, window: FloatArray, out: FloatArray) -> None:  # pragma: no cover - compiled
+def _fold(x: FloatArray, begins: IntArray, window: FloatArray, out: FloatArray) -> None:
     """Frames of `x` (row,) that begin at rows `begins` (frame,), windowed and folded to half their length: (frame, M),
     whose cosine transform is the lapped one."""
     M = out.shape[1]
@@ -483,7 +494,7 @@ def _fold(x: FloatArray, begins: IntArray, window: FloatArray, out: FloatArray) 
 
 
 @njit(cache=True, error_model="numpy")
-def filtered(  # pragma: no cover - compiled
+def filtered(
     x: FloatArray, bounds: IntArray, gaps: IntArray, keep: FloatArray, new: FloatArray, old: FloatArray
 ) -> FloatArray:
     """`x` (row,) behind a pole whose coefficients (gap,) depend on the rows lost in front of each row (`gaps`)."""
@@ -497,7 +508,7 @@ def filtered(  # pragma: no cover - compiled
 
 
 @njit(cache=True, error_model="numpy")
-def _read(x: FloatArray, below: IntArray, share: FloatArray) -> FloatArray:  # pragma: no cover - compiled
+def _read(x: FloatArray, below: IntArray, share: FloatArray) -> FloatArray:
     out = np.empty(len(below))
     for i in range(len(below)):
         k = below[i]

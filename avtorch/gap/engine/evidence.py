@@ -11,15 +11,18 @@ Rossell 2010).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from avtorch.gap.engine.coordinates import COORDINATES, EFFECTS, INDEX
 from avtorch.gap.engine.gauss_newton import linearised, normal_prior, whitened_under_noise
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import claimed, freedom, log_sum
 from avtorch.gap.engine.priors import LOST_NATS, ONSET_ODDS, SHIFT_NATS, TRIED_NATS
-from avtorch.gap.engine.shape_error import effect_energy, log_prior, shape_likelihood
+from avtorch.gap.engine.shape_error import effect_energy, shape_likelihood, shape_log_prior
 
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 _STUDENT_3 = math.log(2 / (math.pi * math.sqrt(3)))  # log density at the centre, scale 1
@@ -28,23 +31,32 @@ _ROUNDS = 4  # until the noise beside a force map has settled within a tenth of 
 _BASE_SD = {"T_L": 0.7, "K_L": 0.3}  # of log T_L; scale of K_L, as `simulator.plant.BASELINE` has them
 
 
-def log_prior_density(h: Hypothesis) -> float:
-    """Log density of the priors at the hypothesis's values [nats]."""
-    total = 0.0
-    for name in h.free:
-        x = h[name]
+def log_prior(h: Hypothesis, names: Sequence[str], x: Tensor) -> Tensor:
+    """Log density (...) of the priors [nats] with coordinates `names` at `x` (..., coordinate), others at their values.
+
+    By autograd.
+    """
+    own = {n: torch.as_tensor(h[n], dtype=x.dtype) for n in h.free} | dict(zip(names, x.unbind(-1), strict=True))
+    total = torch.zeros_like(x[..., 0])
+    for name, at in own.items():
         mean, scale = normal_prior(name, h.neutral[INDEX[name]])
         if name == "T_L":
-            z = (math.log(x) - mean) / _BASE_SD[name]
-            total += -0.5 * z * z - math.log(_BASE_SD[name] * x) - _HALF_LOG_2PI
+            z = (at.log() - mean) / _BASE_SD[name]
+            total = total - 0.5 * z * z - at.log() - math.log(_BASE_SD[name]) - _HALF_LOG_2PI
+        elif name == "K_L":
+            total = total + _student((at - mean) / _BASE_SD[name]) - math.log(_BASE_SD[name])
         elif name in COORDINATES and COORDINATES[name].mean is None:
             c = COORDINATES[name]
-            total += _student((x - mean) / c.scale) - math.log(c.scale) + (0.0 if c.signed else math.log(2))
-        elif name == "K_L":
-            total += _student((x - mean) / _BASE_SD[name]) - math.log(_BASE_SD[name])
+            sides = 0.0 if c.signed else math.log(2)
+            total = total + _student((at - mean) / c.scale) - math.log(c.scale) + sides
         else:
-            total += -0.5 * ((x - mean) / scale) ** 2 - math.log(scale) - _HALF_LOG_2PI
-    return total + sum(_size_density(h, e) for e in h.effects)
+            total = total - 0.5 * ((at - mean) / scale) ** 2 - math.log(scale) - _HALF_LOG_2PI
+    for effect in h.effects:
+        sized = [(own[c.name] - h.neutral[INDEX[c.name]]) / c.faint for c in EFFECTS[effect].coordinates if c.faint]
+        if sized:
+            square = sum(z * z for z in sized)
+            total = total + (-1 / torch.as_tensor(square).clamp_min(1e-9)).clamp_min(_IMPOSSIBLE)
+    return total
 
 
 def evaluate_evidence(h: Hypothesis) -> Hypothesis:
@@ -65,10 +77,11 @@ def evaluate_evidence(h: Hypothesis) -> Hypothesis:
         h.effect_energy = effect_energy(h.data, h.predicted - base.predicted)
         h.shape = shape_likelihood(h.data, h.residual, h.effect_energy)
     if h.shape is not None:
-        h.shape_log = h.shape.nats + log_prior(h.effects)
+        h.shape_log = h.shape.nats + shape_log_prior(h.effects)
     gain = min(h.claimed - first_claimed, h.log_likelihood - first.log_likelihood)
     volume = len(names) * _HALF_LOG_2PI - 0.5 * float(np.linalg.slogdet(h.information)[1])
-    h.evidence = gain + log_sum(h.shape_log) + log_prior_density(h) + volume + _onset_odds(h) + _force_density(h)
+    prior = float(log_prior(h, names, torch.as_tensor(h.values[[INDEX[n] for n in names]])))
+    h.evidence = gain + log_sum(h.shape_log) + prior + volume + _onset_odds(h) + _force_density(h)
     h.evidence -= LOST_NATS * len(h.lost) + SHIFT_NATS * len(h.shift_speeds) * ("gear_shift" in h.effects)
     h.score = h.evidence - TRIED_NATS * (len(h.effects) + (h.force is not None))
     return h
@@ -83,13 +96,8 @@ def _force_density(h: Hypothesis) -> float:
     return h.force.size_nats + 0.5 * free - 0.5 * float(b @ b) / size**2 - len(b) * math.log(size)
 
 
-def _student(z: float) -> float:
-    return _STUDENT_3 - 2 * math.log1p(z * z / 3)
-
-
-def _size_density(h: Hypothesis, effect: str) -> float:
-    size = EFFECTS[effect].size(h.values, h.neutral)
-    return max(-1 / max(size * size, 1e-9), _IMPOSSIBLE)
+def _student(z: Tensor) -> Tensor:
+    return _STUDENT_3 - 2 * torch.log1p(z * z / 3)
 
 
 def _onset_odds(h: Hypothesis) -> float:

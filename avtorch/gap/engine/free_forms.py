@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -59,14 +59,12 @@ _OF_LAGS = ("linear", "sided")  # forms in whose fit the car's own lag moves far
 class FreeForm:
     """A linear family: `columns` (column, channel, frame, bin) are the responses to its demands of coefficient one.
 
-    `terms` (column,): each demand in words; the family of a `name` is in `family.FORMS`.
-    `sizes`: prior standard deviations of a coefficient, each with its log prior probability; several where there are
-    more coefficients than any drive tells.
+    The family of a `name` is in `family.FORMS`. `sizes`: prior standard deviations of a coefficient, each with its log
+    prior probability; several where there are more coefficients than any drive tells.
     """
 
     name: str
     columns: FloatArray = field(repr=False)
-    terms: tuple[str, ...] = field(repr=False)
     sizes: tuple[tuple[float, float], ...] = ((COEFFICIENT_SD, 0.0),)
 
 
@@ -84,11 +82,10 @@ class FreeFormFit(NamedTuple):
 
 
 class Tone(NamedTuple):
-    """A steady line: its fit, its frequency [Hz] and the channel that shows it best."""
+    """A steady line: its fit and its frequency [Hz]."""
 
     fit: FreeFormFit
     frequency: float
-    channel: str
 
 
 def families(h: Hypothesis) -> dict[str, FreeForm]:
@@ -97,13 +94,13 @@ def families(h: Hypothesis) -> dict[str, FreeForm]:
     u = h["K_L"] * h.command()
     short, own, long, longest = _bank(h)
     up = np.maximum(u, 0.0)
-    forms = {
-        "linear": _form(h, "linear", [("u", u, lag) for lag in (short, long, longest)]),
-        "sided": _form(h, "sided", [("u > 0", up, lag) for lag in (short, long, longest, own)]),
-    }
+    lags = np.array([short, long, longest])
     # a gain by sign is a force map: at rest, lags by sign change nothing
-    *others, car = forms["sided"].columns
-    forms["sided"] = replace(forms["sided"], columns=np.array(others) - car, terms=forms["sided"].terms[:-1])
+    *others, car = demand_response(h, np.array([up] * 4), np.append(lags, own))
+    forms = {
+        "linear": FreeForm("linear", demand_response(h, np.array([u] * 3), lags)),
+        "sided": FreeForm("sided", np.array(others) - car),
+    }
     if h.force is None and (maps := map_forms(h.data)):
         forms["map"] = map_free_form(h, maps[-1])
     return forms
@@ -113,15 +110,14 @@ def map_free_form(h: Hypothesis, form: MapForm) -> FreeForm:
     """The curves of a force map as a form beside a hypothesis without one."""
     columns = demand_response(h, form.demands, np.full(form.count, h["T_L"]))
     sizes = tuple(zip(MAP_SIZES.tolist(), size_log_prior().tolist(), strict=True))
-    return FreeForm("map", columns, tuple(f"curve {k + 1}" for k in range(form.count)), sizes)
+    return FreeForm("map", columns, sizes)
 
 
 def mirror_columns(h: Hypothesis) -> FreeForm:
     """The linear bank run backwards in time: the answer to a command before it was given."""
     lags = np.array(_bank(h))
     demands = np.tile(h["K_L"] * h.command(), (len(lags), 1))
-    columns = demand_response(h, demands, lags, backwards=True)
-    return FreeForm("mirror", columns, tuple(f"lag -{lag:.2f} s" for lag in lags))
+    return FreeForm("mirror", demand_response(h, demands, lags, backwards=True))
 
 
 def block(h: Hypothesis, form: FreeForm, iterations: int = 4) -> FreeFormFit:
@@ -179,17 +175,16 @@ def tone(h: Hypothesis, fmin: float = 0.1) -> Tone:
     evidence: it grows with the length of the log.
     """
     data = h.data
-    frequency, channel, tried = _strongest_line(h, fmin)
+    frequency, tried = _strongest_line(h, fmin)
     if not tried:
-        return Tone(FreeFormFit(0.0, None, np.zeros(2 * data.channel_count)), 0.0, "")
+        return Tone(FreeFormFit(0.0, None, np.zeros(2 * data.channel_count)), 0.0)
     angle = 2.0 * math.pi * frequency * (data.time - data.time[0])
     waves = data.transform([np.cos(angle), np.sin(angle)])
     columns = np.zeros((data.channel_count, 2, data.channel_count, *waves.shape[1:]))
     for c in range(data.channel_count):
         columns[c, :, c] = waves
-    terms = tuple(f"{name}, {wave}" for name in data.channels for wave in ("cosine", "sine"))
-    fit = block(h, FreeForm("tone", columns.reshape(-1, *columns.shape[2:]), terms))
-    return Tone(fit._replace(nats=fit.nats - math.log(tried)), frequency, data.channels[channel])
+    fit = block(h, FreeForm("tone", columns.reshape(-1, *columns.shape[2:])))
+    return Tone(fit._replace(nats=fit.nats - math.log(tried)), frequency)
 
 
 def demand_response(h: Hypothesis, demands: FloatArray, lags: FloatArray, *, backwards: bool = False) -> FloatArray:
@@ -215,9 +210,7 @@ def demand_response(h: Hypothesis, demands: FloatArray, lags: FloatArray, *, bac
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def first_order(  # pragma: no cover - compiled
-    time: FloatArray, starts: BoolArray, demand: FloatArray, lag: float
-) -> tuple[FloatArray, FloatArray]:
+def first_order(time: FloatArray, starts: BoolArray, demand: FloatArray, lag: float) -> tuple[FloatArray, FloatArray]:
     """Acceleration (row,) of a lag [s] behind a held `demand` (row,), and its integral (row,), from rest at it.
 
     Each of `starts` (row,) begins anew: at the demand's own value, and with an integral of 0.
@@ -240,18 +233,27 @@ def first_order(  # pragma: no cover - compiled
     return accel, speed
 
 
-def band_products(data: DriveData, x: FloatArray) -> FloatArray:
-    """Inner products (band, channel, channel, signal, signal) over frames and bins of x (signal, channel, frame, bin).
+def band_products(data: DriveData, x: FloatArray, y: FloatArray | None = None) -> FloatArray:
+    """Inner products (band, channel, channel, signal, signal) over frames and bins of x and y (signal, channel, frame,
+    bin), of x with itself where there is no y.
 
     With them, whitened inner products under any noise, and the residual's covariance for any coefficients, cost no
     pass over the coefficients of the drive.
     """
-    count, channels = x.shape[:2]
-    out = np.empty((data.band_count, channels, channels, count, count))
+    y = x if y is None else y
+    channels, frames = x.shape[1:3]
+    out = np.empty((data.band_count, channels, channels, len(x), len(y)))
     for band, (low, high) in enumerate(zip(data.band_edges[:-1], data.band_edges[1:], strict=True)):
-        part = np.ascontiguousarray(x[..., low:high]).reshape(count * channels, -1)
-        out[band] = (part @ part.T).reshape(count, channels, count, channels).transpose(1, 3, 0, 2)
+        size = (high - low) * frames
+        one = x[..., low:high].reshape(len(x) * channels, size)
+        other = one if y is x else y[..., low:high].reshape(len(y) * channels, size)
+        out[band] = (one @ other.T).reshape(len(x), channels, len(y), channels).transpose(1, 3, 0, 2)
     return out
+
+
+def gram(noise: FloatArray, products: FloatArray) -> FloatArray:
+    """Inner products (signal, signal) in units of the `noise` (band, channel, channel), of `band_products`."""
+    return np.asarray(np.tensordot(np.linalg.inv(noise), products, 3))
 
 
 def linear_evidence(
@@ -274,7 +276,7 @@ def linear_evidence(
     best, at = -math.inf, np.zeros(len(precision))
     spread = np.zeros_like(noise) if integrated or h.force_spread is None else h.force_spread
     for _ in range(iterations):
-        weighted = np.tensordot(np.linalg.inv(noise), products, 3)
+        weighted = gram(noise, products)
         information = weighted[1:, 1:] + np.diag(precision)
         try:
             factor = cho_factor(information)
@@ -307,12 +309,6 @@ def _moved(h: Hypothesis, moves: FloatArray) -> Hypothesis:
 def _bank(h: Hypothesis) -> tuple[float, ...]:
     """Lags [s] of a linear bank around the car's own, in the order of `LAG_RATIOS`."""
     return tuple(max(h["T_L"] * ratio, SHORTEST_LAG_S) for ratio in LAG_RATIOS)
-
-
-def _form(h: Hypothesis, name: str, demands: Sequence[tuple[str, FloatArray, float]]) -> FreeForm:
-    """A form from its demands: what each is, its rows (row,), and the lag [s] behind it."""
-    columns = demand_response(h, np.array([w for _, w, _ in demands]), np.array([lag for *_, lag in demands]))
-    return FreeForm(name, columns, tuple(f"{term}, lag {lag:.2f} s" for term, _, lag in demands))
 
 
 def _first_order_backwards(
@@ -412,15 +408,15 @@ def _best_course(score: FloatArray, information: FloatArray, priors: Sequence[Fl
     return course, cost
 
 
-def _strongest_line(h: Hypothesis, fmin: float) -> tuple[float, int, int]:
-    """Frequency [Hz] and channel of the spectral line that stands out most, and how many bins were looked at."""
+def _strongest_line(h: Hypothesis, fmin: float) -> tuple[float, int]:
+    """Frequency [Hz] of the spectral line that stands out most, and how many bins were looked at."""
     data = h.data
     longest = int(np.argmax(np.diff(data.bounds)))
     rows = slice(data.bounds[longest] + data.warm_rows, data.bounds[longest + 1])
     measured = data.channel_rows(data.accel, data.speed)
     fmax = min(TONE_HZ, float(data.frequency[-1]))  # of the coefficients that count
-    best, line = -math.inf, (0.0, 0, 0)
-    for channel, (y, x) in enumerate(zip(measured, h.rows(), strict=True)):
+    best, line = -math.inf, (0.0, 0)
+    for y, x in zip(measured, h.rows(), strict=True):
         error = (y - x)[rows]
         frequency = np.fft.rfftfreq(len(error), data.dt)
         step = float(frequency[1])
@@ -438,7 +434,7 @@ def _strongest_line(h: Hypothesis, fmin: float) -> tuple[float, int, int]:
         k = int(np.argmax(excess))
         if excess[k] - math.log(tried) > best:
             best = float(excess[k]) - math.log(tried)
-            line = float(frequency[k]) + step * _between_bins(power[k - 1 : k + 2]), channel, tried
+            line = float(frequency[k]) + step * _between_bins(power[k - 1 : k + 2]), tried
     return line
 
 

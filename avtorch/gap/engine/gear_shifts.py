@@ -403,7 +403,7 @@ class _Shifts:
 
 
 @njit(cache=True, error_model="numpy")
-def upshift_times(  # pragma: no cover - compiled
+def upshift_times(
     time: FloatArray, speed: FloatArray, starts: BoolArray, level: float, hysteresis: float
 ) -> FloatArray:
     """Times (upshift,) [s], between rows, at which the `speed` (row,) [m/s] rises through a `level`, having been
@@ -426,9 +426,7 @@ def upshift_times(  # pragma: no cover - compiled
 
 
 @njit(cache=True, error_model="numpy")
-def dips_below(  # pragma: no cover - compiled
-    speed: FloatArray, starts: BoolArray, level: float
-) -> FloatArray:
+def dips_below(speed: FloatArray, starts: BoolArray, level: float) -> FloatArray:
     """How far (dip,) [m/s] the `speed` (row,) fell below a `level` each time before it rose above it again."""
     out = np.empty(len(speed))
     count = 0
@@ -448,7 +446,7 @@ def dips_below(  # pragma: no cover - compiled
 
 
 @njit(cache=True, error_model="numpy")
-def _pulses(  # pragma: no cover - compiled
+def _pulses(
     time: FloatArray, starts: BoolArray, demand: FloatArray, begins: FloatArray, first: IntArray, duration: float
 ) -> FloatArray:
     """The lost demand (upshift, row) from `first` rows (upshift,) on: `demand` times the share of each step that lies
@@ -475,7 +473,7 @@ def _pulses(  # pragma: no cover - compiled
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _dots(rows: FloatArray, first: IntArray, values: FloatArray) -> FloatArray:  # pragma: no cover - compiled
+def _dots(rows: FloatArray, first: IntArray, values: FloatArray) -> FloatArray:
     """Inner products (signal,) of signals `rows` (signal, row) with all pulses."""
     out = np.zeros(len(rows))
     n = rows.shape[1]
@@ -488,9 +486,7 @@ def _dots(rows: FloatArray, first: IntArray, values: FloatArray) -> FloatArray: 
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _energy(  # pragma: no cover - compiled
-    first: IntArray, values: FloatArray, information: FloatArray, cover: FloatArray
-) -> float:
+def _energy(first: IntArray, values: FloatArray, information: FloatArray, cover: FloatArray) -> float:
     """p' D A D p of all pulses together, which are in order of time."""
     reach, rows = len(information), values.shape[1]
     seen = values.copy()
@@ -515,7 +511,7 @@ def _energy(  # pragma: no cover - compiled
 
 
 @njit(cache=True, error_model="numpy")
-def _take_out_all(  # pragma: no cover - compiled
+def _take_out_all(
     score: FloatArray, information: FloatArray, cover: FloatArray, first: IntArray, values: FloatArray, sign: float
 ) -> None:
     """`take_out` of all pulses."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -110,20 +110,12 @@ class Hypothesis:
     # other hypotheses ------------------------------------------------------------------------------------------------
     def copy(self) -> Self:
         """A copy with the same prediction, if there is one; what evidence has set is left out."""
-        other = type(self)(
-            data=self.data,
+        other = replace(
+            self,
             values=self.values.copy(),
             effects=list(self.effects),
             onsets=dict(self.onsets),
-            shift_speeds=self.shift_speeds,
-            lost=self.lost,
-            neutral=self.neutral,
-            alone=self.alone,
-            base=self.base,
-            baseline=self.baseline,
-            force=self.force,
             force_coefficients=self.force_coefficients.copy(),
-            plain=self.plain,
         )
         for name in ("predicted", "residual", "covariance", "log_likelihood", "force_columns", "force_spread"):
             if hasattr(self, name):
@@ -165,11 +157,6 @@ class Hypothesis:
         other.base, other.plain, other.force, other.force_coefficients = self.plain, None, None, np.zeros(0)
         other.force_columns = other.force_spread = None
         return other
-
-    @property
-    def reference_speed(self) -> float:
-        """At which slopes with speed are neutral [m/s]."""
-        return self.data.reference_speed
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -216,7 +203,7 @@ class Hypothesis:
             grid.starts,
             grid.accel0,
             self.shift_speeds,
-            self.reference_speed,
+            self.data.reference_speed,
             accel,
             gained,
         )

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 from avtorch.gap.engine.average import ModelAverage, average, examined_sets
-from avtorch.gap.engine.coordinates import EFFECTS
+from avtorch.gap.engine.coordinates import EFFECTS, base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.evidence import evaluate_evidence
 from avtorch.gap.engine.gauss_newton import fit
@@ -64,11 +64,10 @@ def infer(
         base = base_fit(data, baseline)
     told("outliers", 0, 1)
     gears = "gear_shift" in effects
-    if data.accel is not None:
-        cleaned = _without_outliers(base, gears)
-        if cleaned is not None:
-            data = cleaned
-            base = base_fit(data, baseline)
+    cleaned = cleaned_drives(base, gears=gears)
+    if cleaned is not None:
+        data = cleaned
+        base = base_fit(data, baseline)
     alone = data.channel_count == 1
     if alone:
         data = data.below(ONE_CHANNEL_HZ)
@@ -82,19 +81,15 @@ def infer(
     search.run()
     told("average", 0, 1)
     named = [e for e in effects if not e.startswith("~")]
-    found = average(examined_sets(search), alone=alone, effects=[*named, *map(_base, named)], most=most, prior=prior)
+    found = average(
+        examined_sets(search), alone=alone, effects=[*named, *map(base_name, named)], most=most, prior=prior
+    )
     return Inference(search.base, search, found, alone)
 
 
-def _base(effect: str) -> str:
-    return EFFECTS[effect].base if effect in EFFECTS else effect
-
-
-def _without_outliers(base: Hypothesis, gears: bool) -> DriveData | None:
-    """The drives with outliers of the accelerometer replaced; None where there are hardly any. What a gear shift does
-    is none."""
-    base.base = base
-    evaluate_evidence(base)
+def cleaned_drives(base: Hypothesis, *, gears: bool = False) -> DriveData | None:
+    """The drives of a fitted base with outliers of the accelerometer replaced; None where there are hardly any. What a
+    gear shift does is none, if `gears` may shift."""
     h = base
     if gears:
         speeds, nats = shift_speeds(base)

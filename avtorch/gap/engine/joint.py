@@ -17,22 +17,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
-from avtorch.arrays import BoolArray, FloatArray
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.engine.coordinates import COORDINATES, INDEX, Coordinate, EngineEffect
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.free_forms import COEFFICIENT_SD, demand_response, families
+from avtorch.gap.engine.free_forms import COEFFICIENT_SD, band_products, demand_response, families, gram
 from avtorch.gap.engine.gauss_newton import jacobian, normal_prior
 from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.inference import cleaned_drives
 from avtorch.gap.engine.likelihood import claim_bands, claimed, whiten
-from avtorch.gap.engine.outliers import sensor_outliers, without_outliers
 from avtorch.gap.engine.priors import ONE_CHANNEL_HZ
 from avtorch.gap.engine.recorder import aligned, base_fit
 from avtorch.gap.simulator.plant import GapPlant
@@ -40,12 +40,10 @@ from avtorch.gap.simulator.plant import GapPlant
 Link = Literal["value", "log", "plus", "times"]
 Side = Literal["before", "after", "both"]
 
-_CAR = ("T_L", "K_L", "dead_time")
 _SCALES = {"T_L": COORDINATES["log_brake_lag"], "K_L": COORDINATES["gain_step"], "dead_time": COORDINATES["dead_time"]}
 _STARTS = {"T_L": (0.0, 0.5, -0.5), "K_L": (0.0,), "dead_time": (0.0, 0.1, -0.1)}
 _LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
 _FEWEST_FRAMES = 3
-_OUTLIER_NATS, _MOST_OUTLIERS = 10.0, 0.2  # as in `inference`
 NOISE_COUNTS = 4.0
 """Coefficients that the noise of one car without free forms is worth, in each band: many forms would leave none."""
 SIZES = (0.03, 0.1, COEFFICIENT_SD)
@@ -54,34 +52,6 @@ _BLOCK_S, _FEWEST_BLOCKS = 10.0, 5
 NO_CHANGE = frozenset({"gain_change", "gear_shift", "command_hold", "dead_time", "~linear"})
 """What is no change of a car between drives: of one drive, of chance, or a change of T_L, K_L and dead time."""
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
-
-
-@dataclass(eq=False)
-class SideData(DriveData):
-    """The drives of one side, framed as part of both: speeds are relative to the `reference` [m/s] of both."""
-
-    reference: float = 15.0
-
-    @property
-    def reference_speed(self) -> float:
-        return self.reference
-
-    @classmethod
-    def part(cls, whole: DriveData, rows: BoolArray) -> SideData:
-        """The stretches of `whole` at `rows` (row,), which are successive."""
-        first, last = int(np.argmax(rows)), len(rows) - int(np.argmax(rows[::-1]))
-        frames = [(i - first, n) for i, n in whole.frames if first <= i < last]
-        frame_rows = np.concatenate([np.full(n, first <= i < last) for i, n in whole.frames])
-        cut = {f.name: getattr(whole, f.name) for f in fields(DriveData)}
-        by_row = ("time", "stamp", "log", "source", "count", "command", "accel", "speed", "smooth_speed", "position")
-        for name in by_row:
-            cut[name] = None if cut[name] is None else cut[name][first:last]
-        cut["raw_accel"] = None if whole.raw_accel is None else whole.raw_accel[first:last]
-        inside = (whole.bounds >= first) & (whole.bounds <= last)
-        cut |= {"bounds": whole.bounds[inside] - first, "frames": frames, "cache": {}}
-        cut |= {"used": whole.used[frame_rows], "frame_time": whole.frame_time[frame_rows[whole.used]]}
-        cut["measured"] = whole.measured[:, frame_rows[whole.used]]
-        return cls(**cut, reference=whole.reference_speed)
 
 
 @dataclass(frozen=True)
@@ -194,7 +164,7 @@ class JointModel:
     """Both sides: `whole` and its parts; `columns` (column, channel, frame, bin) of the free forms on each side."""
 
     whole: DriveData
-    sides: tuple[SideData, SideData]
+    sides: tuple[DriveData, DriveData]
     base: Hypothesis
     own_effects: frozenset[str] = frozenset()
     sd: float = COEFFICIENT_SD
@@ -215,14 +185,14 @@ class JointModel:
         if later is not None:
             whole = later
             base = base_fit(whole, baseline)
-        found = sensor_outliers(base) if whole.accel is not None else None
-        if found is not None and found.nats > _OUTLIER_NATS and found.flags.mean() < _MOST_OUTLIERS:
-            whole = whole.with_accel(without_outliers(whole, found.errors, found.flags))
+        cleaned = cleaned_drives(base)
+        if cleaned is not None:
+            whole = cleaned
             base = base_fit(whole, baseline)
         rows = whole.log >= logs_before
         if rows.all() or not rows.any():
             raise InputError(f"{'before' if rows.all() else 'after'}: has no stretch that is long enough")
-        sides = SideData.part(whole, ~rows), SideData.part(whole, rows)
+        sides = whole.part(~rows), whole.part(rows)
         for name, side in zip(("before", "after"), sides, strict=True):
             if side.frame_count < _FEWEST_FRAMES:
                 raise InputError(f"{name}: found {side.frame_count} frames, needs {_FEWEST_FRAMES} or more")
@@ -259,14 +229,9 @@ class JointModel:
         bare = max((self.fit((), s) for s in starts), key=lambda f: f.objective)
         shapes = self._free_forms(bare)
         J = self._derivatives(bare)
-        inner = sum(
-            gram(n, products(h.data, J[s], J[s])) for s, (h, n) in enumerate(zip(bare.sides, bare.noise, strict=True))
-        )
-        cross = sum(
-            gram(n, products(h.data, J[s], shapes[s]))
-            for s, (h, n) in enumerate(zip(bare.sides, bare.noise, strict=True))
-        )
-        assert isinstance(inner, np.ndarray)
+        both = list(zip(bare.sides, bare.noise, J, shapes, strict=True))
+        inner = np.sum([gram(n, band_products(h.data, j, j)) for h, n, j, _ in both], axis=0)
+        cross = np.sum([gram(n, band_products(h.data, j, x)) for h, n, j, x in both], axis=0)
         taken = np.linalg.solve(inner + np.diag(self._prior(bare.coordinates)[1]), cross)
         beyond = [s - np.tensordot(taken.T, j, 1) for s, j in zip(shapes, J, strict=True)]
         self._set_columns((beyond[0], beyond[1]))
@@ -277,12 +242,12 @@ class JointModel:
             H = self._system(fit, self._derivatives(fit))[0]
             occam = -len(fit.c) * math.log(self.sd) - 0.5 * float(np.linalg.slogdet(H)[1])
             each.append((fit.objective + occam, self.sd, fit))
-        _, self.sd, fit = max(each, key=lambda x: x[0])
-        self.start = self.evaluated(fit)
+        _, self.sd, self.start = max(each, key=lambda x: x[0])
+        self.evaluated(self.start)
 
     def _set_columns(self, columns: tuple[FloatArray, FloatArray]) -> None:
         self.columns = columns
-        self._inner = [products(data, x, x) for data, x in zip(self.sides, columns, strict=True)]
+        self._inner = [band_products(data, x, x) for data, x in zip(self.sides, columns, strict=True)]
 
     def _free_forms(self, fit: JointFit) -> tuple[FloatArray, FloatArray]:
         """Columns of all families on each side: dynamics, force map, forces by speed, faults of the accelerometer."""
@@ -308,7 +273,8 @@ class JointModel:
         self, changes: Sequence[Change], coordinates: Sequence[JointCoordinate], x: FloatArray, after: bool
     ) -> Hypothesis:
         """One side's hypothesis at `x` (coordinate,)."""
-        h = replace_data(self.base, self.sides[after])
+        h = self.base.copy()
+        h.data = self.sides[after]
         h.effects += [change.effect for change in changes if change.acts(after)]
         for c, value in zip(coordinates, x, strict=True):
             if not (c.after if after else c.before):
@@ -348,15 +314,15 @@ class JointModel:
         for h, columns, inner in zip(sides, self.columns, self._inner, strict=True):
             P = np.empty((*inner.shape[:3], 1 + count, 1 + count))
             P[..., 1:, 1:] = inner
-            P[..., :1, :1] = products(h.data, h.residual[None], h.residual[None])
-            P[..., :1, 1:] = products(h.data, h.residual[None], columns)
+            P[..., :1, :1] = band_products(h.data, h.residual[None], h.residual[None])
+            P[..., :1, 1:] = band_products(h.data, h.residual[None], columns)
             P[..., 1:, :1] = np.swapaxes(np.swapaxes(P[..., :1, 1:], -1, -2), 1, 2)
             sums.append(P)
         c = np.zeros(count)
         for _ in range(rounds if count else 1):
             total = sum(gram(n, P) for n, P in zip(noise, sums, strict=True))
             assert isinstance(total, np.ndarray)
-            c = _solved(total[1:, 1:] + self.sd**-2 * np.eye(count), total[1:, 0])
+            c = np.linalg.solve(total[1:, 1:] + self.sd**-2 * np.eye(count), total[1:, 0])
             left = np.concatenate([[1.0], -c])
             noise = [noise_left(P, left, h.data, k) for P, h, k in zip(sums, sides, self.known, strict=True)]
         nats, low = (
@@ -387,11 +353,11 @@ class JointModel:
         H, g = np.zeros((n + count, n + count)), np.zeros(n + count)
         for h, noise, j, columns, inner in zip(fit.sides, fit.noise, J, self.columns, self._inner, strict=True):
             left = self.left(fit, h)
-            H[:n, :n] += gram(noise, products(h.data, j, j))
-            H[:n, n:] += gram(noise, products(h.data, j, columns))
+            H[:n, :n] += gram(noise, band_products(h.data, j, j))
+            H[:n, n:] += gram(noise, band_products(h.data, j, columns))
             H[n:, n:] += gram(noise, inner)
-            g[:n] += gram(noise, products(h.data, j, left[None]))[:, 0]
-            g[n:] += gram(noise, products(h.data, columns, left[None]))[:, 0]
+            g[:n] += gram(noise, band_products(h.data, j, left[None]))[:, 0]
+            g[n:] += gram(noise, band_products(h.data, columns, left[None]))[:, 0]
         H[n:, :n] = H[:n, n:].T
         mean, precision = self._prior(fit.coordinates)
         precision = np.concatenate([precision, np.full(count, self.sd**-2)])
@@ -454,8 +420,7 @@ class JointModel:
         """With its evidence over one car, by Laplace's approximation, as in `evidence`."""
         fit.derivatives = self._derivatives(fit)
         fit.information = self._system(fit, fit.derivatives)[0]
-        start = getattr(self, "start", fit)
-        gain = min(fit.claimed - start.claimed, fit.log_likelihood - start.log_likelihood)
+        gain = min(fit.claimed - self.start.claimed, fit.log_likelihood - self.start.log_likelihood)
         mean, precision = self._prior(fit.coordinates)
         gain -= 0.5 * self.sd**-2 * float(fit.c @ fit.c)
         for c, x, m, p in zip(fit.coordinates, fit.x, mean, precision, strict=True):
@@ -472,9 +437,6 @@ class JointModel:
             gain += max(-1 / max(size, 1e-9), -60.0) if any(c and c.faint for c, _ in each) else 0.0
         volume = len(fit.x) * _HALF_LOG_2PI - 0.5 * float(np.linalg.slogdet(fit.information)[1])
         fit.evidence = gain + volume
-        if hasattr(self, "start"):
-            return fit
-        self.start = fit
         return fit
 
     @cached_property
@@ -508,18 +470,6 @@ class JointModel:
         return likelihood, blocks, 4 * drift / weight
 
 
-def replace_data(h: Hypothesis, data: DriveData) -> Hypothesis:
-    """The hypothesis about other rows, not evaluated."""
-    return Hypothesis(
-        data,
-        values=h.values.copy(),
-        effects=list(h.effects),
-        neutral=h.neutral,
-        alone=h.alone,
-        baseline=h.baseline,
-    )
-
-
 def block_scores(h: Hypothesis, noise: FloatArray, derivatives: FloatArray, left: FloatArray) -> FloatArray:
     """Slopes of the log likelihood (parameter, block) over successive blocks of a drive.
 
@@ -549,22 +499,6 @@ def blocks_of(data: DriveData) -> list[slice]:
     return out
 
 
-def products(data: DriveData, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Inner products (band, channel, channel, a, b) over frames and bins of signals (signal, channel, frame, bin)."""
-    C = data.channel_count
-    out = np.empty((data.band_count, C, C, len(a), len(b)))
-    for band, (low, high) in enumerate(zip(data.band_edges[:-1], data.band_edges[1:], strict=True)):
-        size = (high - low) * data.frame_count
-        x, y = a[..., low:high].reshape(len(a) * C, size), b[..., low:high].reshape(len(b) * C, size)
-        out[band] = (x @ y.T).reshape(len(a), C, len(b), C).transpose(1, 3, 0, 2)
-    return out
-
-
-def gram(noise: FloatArray, products: FloatArray) -> FloatArray:
-    """Inner products (a, b) in units of the noise."""
-    return np.asarray(np.tensordot(np.linalg.inv(noise), products, 3))
-
-
 def noise_left(products: FloatArray, left: FloatArray, data: DriveData, known: FloatArray | None) -> FloatArray:
     """Covariance (band, channel, channel) of what is left of signal 0 of `products`, `known` worth `NOISE_COUNTS`."""
     S = (products @ left) @ left
@@ -582,7 +516,3 @@ def nats_of(data: DriveData, noise: FloatArray, known: FloatArray | None, fmax: 
         return nats
     n = claim_bands(data, fmax)
     return nats - 0.5 * NOISE_COUNTS * float(np.linalg.slogdet(noise[:n])[1].sum())
-
-
-def _solved(A: FloatArray, b: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.solve(A, b), np.float64)

@@ -22,7 +22,8 @@ from scipy.special import ndtr, ndtri
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import INDEX
-from avtorch.gap.engine.density import log_prior, support
+from avtorch.gap.engine.density import support
+from avtorch.gap.engine.evidence import log_prior
 from avtorch.gap.engine.gauss_newton import force_columns, jacobian, prior_terms, whitened_jacobian
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
@@ -78,11 +79,6 @@ class Laplace:
     def widened(self) -> FloatArray:
         """Covariance (coordinate, coordinate) that covers the scatter of the drive's parts."""
         return self.stretch @ self.covariance @ self.stretch.T
-
-    @property
-    def widest(self) -> float:
-        """Largest factor on the standard deviation of a coordinate."""
-        return float(np.sqrt(np.diag(self.widened) / np.diag(self.covariance)).max())
 
     def draws(self, count: int, rng: np.random.Generator, *, widen: bool = True, times: float = 1.0) -> FloatArray:
         """Draws (draw, coordinate) within the limits, of `times` the standard deviation."""

@@ -44,15 +44,9 @@ _ROUNDS = 3  # of stretches given parameters, parameters given stretches
 
 
 class LostMessages(NamedTuple):
-    """Stretches `rows` ((from, to), ...) of lost messages, `to` exclusive, and what they gain in all, `nats`.
-
-    `fraction` of the rows that are lost; `count` and `mean_length_s` of the stretches.
-    """
+    """Stretches `rows` ((from, to), ...) of lost messages, `to` exclusive, and what they gain in all, `nats`."""
 
     nats: float
-    fraction: float
-    count: int
-    mean_length_s: float
     rows: tuple[tuple[int, int], ...]
 
 
@@ -70,14 +64,7 @@ def lost_messages(h: Hypothesis, sign: float = 1.0, mask: BoolArray | None = Non
     m = pulse_model(h, mask)
     score = demand_score(h, h.covariance, sign * residual)
     rows = best_stretches(m, score)
-    lost = sum(j - i for i, j in rows)
-    return LostMessages(
-        nats=gain_of(m, score, rows),
-        fraction=lost / len(m.demand),
-        count=len(rows),
-        mean_length_s=lost * data.dt / max(len(rows), 1),
-        rows=tuple(rows),
-    )
+    return LostMessages(gain_of(m, score, rows), tuple(rows))
 
 
 def with_lost_messages(h: Hypothesis, mask: BoolArray | None = None) -> Hypothesis | None:
@@ -172,9 +159,7 @@ def schedule(first: IntArray, stop: IntArray, value: FloatArray, apart: int) -> 
 
 
 @njit(cache=True, error_model="numpy")
-def _schedule(  # pragma: no cover - compiled
-    before: IntArray, value: FloatArray
-) -> IntArray:
+def _schedule(before: IntArray, value: FloatArray) -> IntArray:
     """`schedule` of candidates in order, `before` (candidate,) each of which so many may be chosen, too; the last
     first."""
     n = len(before)
@@ -195,7 +180,7 @@ def _schedule(  # pragma: no cover - compiled
 
 # one stretch ---------------------------------------------------------------------------------------------------------
 @njit(cache=True, error_model="numpy")
-def _free_until(blocked: BoolArray) -> IntArray:  # pragma: no cover - compiled
+def _free_until(blocked: BoolArray) -> IntArray:
     """First blocked row from each row on (row,)."""
     n = len(blocked)
     out = np.empty(n, np.int64)
@@ -208,7 +193,7 @@ def _free_until(blocked: BoolArray) -> IntArray:  # pragma: no cover - compiled
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _gains(  # pragma: no cover - compiled
+def _gains(
     m: PulseModel, score: FloatArray, backwards: FloatArray, first: int, most: int, pulse: FloatArray, out: FloatArray
 ) -> int:
     """Gains s' w - w' A w / 2 of the stretches of 1 to `most` rows from row `first` on into `out`, and how many were
@@ -238,7 +223,7 @@ def _gains(  # pragma: no cover - compiled
 
 
 @njit(cache=True, error_model="numpy")
-def _longer(x: NDArray[Any]) -> NDArray[Any]:  # pragma: no cover - compiled
+def _longer(x: NDArray[Any]) -> NDArray[Any]:
     """`x` (element,) and as many free places. A loop: what numba has for it takes seconds to compile."""
     out = np.empty(2 * len(x), x.dtype)
     for k in range(len(x)):
@@ -247,9 +232,7 @@ def _longer(x: NDArray[Any]) -> NDArray[Any]:  # pragma: no cover - compiled
 
 
 @njit(cache=True, error_model="numpy")
-def candidates(  # pragma: no cover - compiled
-    m: PulseModel, score: FloatArray, begin: int, end: int
-) -> tuple[IntArray, IntArray, FloatArray]:
+def candidates(m: PulseModel, score: FloatArray, begin: int, end: int) -> tuple[IntArray, IntArray, FloatArray]:
     """Stretches within rows `begin` to `end` - 1 that gain more than the penalty: `first`, `stop`, `gain` (candidate,).
 
     A stretch begins in a row whose command differs from the one before: a loss that changes nothing is not seen. Of
@@ -274,9 +257,7 @@ def candidates(  # pragma: no cover - compiled
 
 
 @njit(cache=True, error_model="numpy")
-def _best_within(  # pragma: no cover - compiled
-    m: PulseModel, score: FloatArray, begin: int, end: int
-) -> tuple[int, int]:
+def _best_within(m: PulseModel, score: FloatArray, begin: int, end: int) -> tuple[int, int]:
     """First and last row + 1 of the candidate of largest gain within rows `begin` to `end` - 1; (0, 0) without any."""
     first, stop, gain = candidates(m, score, begin, end)
     if len(gain) == 0:
@@ -286,9 +267,7 @@ def _best_within(  # pragma: no cover - compiled
 
 
 @njit(cache=True, error_model="numpy")
-def _put(  # pragma: no cover - compiled
-    m: PulseModel, score: FloatArray, i: int, j: int, sign: float
-) -> None:
+def _put(m: PulseModel, score: FloatArray, i: int, j: int, sign: float) -> None:
     """`score` beside the stretch from row `i` to `j` - 1 (`sign` -1: without it), in place."""
     pulse = np.empty(j - i)
     for k in range(i, j):
@@ -297,7 +276,7 @@ def _put(  # pragma: no cover - compiled
 
 
 @njit(cache=True, error_model="numpy")
-def _conditional_modes(  # pragma: no cover - compiled
+def _conditional_modes(
     m: PulseModel, score: FloatArray, begin: IntArray, end: IntArray, count: int, sweeps: int
 ) -> int:
     """Move, resize, drop and add stretches `begin`, `end` while G gains, in place; the number of stretches left.

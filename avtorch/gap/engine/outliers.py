@@ -73,12 +73,11 @@ _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 class Outliers(NamedTuple):
     """Outliers of the accelerometer beside a hypothesis.
 
-    `nats` of them over none; `smear`: pole of the recorder's filter [a row]; `starts` (outlier,): their first rows;
-    `flags` (row,): all rows that they reach; `errors` (row,) [m/s²]: reading less response.
+    `nats` of them over none; `starts` (outlier,): their first rows; `flags` (row,): all rows that they reach; `errors`
+    (row,) [m/s²]: reading less response.
     """
 
     nats: float
-    smear: float
     flags: BoolArray
     starts: IntArray
     errors: FloatArray
@@ -103,14 +102,14 @@ def sensor_outliers(h: Hypothesis) -> Outliers:
     raw = data.accel if data.raw_accel is None else data.raw_accel
     nothing = np.zeros(len(data.time), bool)
     if raw is None:
-        return Outliers(-math.inf, 0.0, nothing, np.zeros(0, np.int64), np.zeros(len(data.time)))
+        return Outliers(-math.inf, nothing, np.zeros(0, np.int64), np.zeros(len(data.time)))
     # compared on the clock of the readings, not on that of the speed: a shift by parts of a row would smear outliers
     values = h.values.copy()
     values[INDEX["accel_delay"]] -= data.align_s
     errors = raw - h.rows(values)[0]
     found = robust_innovations(errors, data.bounds, data.warm_rows, raw)
     if found is None:
-        return Outliers(-math.inf, 0.0, nothing, np.zeros(0, np.int64), errors)
+        return Outliers(-math.inf, nothing, np.zeros(0, np.int64), errors)
     suspect = ~(_after_steps(data)[found.rows] | _lasting(found.z, max(3, LONGEST_S / data.dt)))
     mixture, student, normal = tail_log_likelihoods(found.z[suspect])
     tails = max(mixture - max(student, normal) - MIXTURE_NATS, mixture - normal - HEAVY_NATS_PER_ROW * suspect.sum())
@@ -123,7 +122,7 @@ def sensor_outliers(h: Hypothesis) -> Outliers:
     lasts = max(1, math.ceil(math.log(0.12) / math.log(smear))) if smear > 0 else 1
     for k in range(lasts):
         flags[np.minimum(starts + k, len(flags) - 1)] = True
-    return Outliers(float(max(tails, additive)), smear, flags, starts, errors)
+    return Outliers(float(max(tails, additive)), flags, starts, errors)
 
 
 def without_outliers(data: DriveData, errors: FloatArray, flags: BoolArray) -> FloatArray:
@@ -132,11 +131,11 @@ def without_outliers(data: DriveData, errors: FloatArray, flags: BoolArray) -> F
     What replaces them is the response and the error between its neighbours, `errors` (row,) [m/s²].
     """
     assert data.accel is not None
-    replaced = flags.copy()
-    replaced[:-1] |= flags[1:]
-    between = np.interp(data.time, data.time[~replaced], errors[~replaced])
+    wrong = flags.copy()
+    wrong[:-1] |= flags[1:]
+    between = np.interp(data.time, data.time[~wrong], errors[~wrong])
     out = data.accel.copy()
-    out[replaced] += (between - errors)[replaced]
+    out[wrong] += (between - errors)[wrong]
     return out
 
 
@@ -222,7 +221,8 @@ def tail_log_likelihoods(z: FloatArray) -> tuple[float, float, float]:
     normal = float((-0.5 * squares / _NORMAL_SCALES**2 - n * np.log(_NORMAL_SCALES)).max()) - n * _HALF_LOG_2PI
     dof, scale = _STUDENT_DOF[:, None], _STUDENT_SCALES
     peak = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * np.log(dof * math.pi) - np.log(scale)
-    student = float((n * peak - (dof + 1) / 2 * _sum_log1p(z * z, 1 / (dof * scale**2))).max())
+    tails = np.log1p(np.multiply.outer(1 / (dof * scale**2), z * z)).sum(-1)
+    student = float((n * peak - (dof + 1) / 2 * tails).max())
     core, ratio = _CORE_SCALES[:, None], _WIDTHS
     wide = core * np.hypot(1.0, ratio)
     # wide over core density: b exp(a z²)
@@ -250,22 +250,6 @@ def _lasting(z: FloatArray, longest: float) -> BoolArray:
     run = np.cumsum(np.diff(large, prepend=large[:1]) > 2)
     out = np.zeros(len(z), bool)
     out[large] = np.bincount(run)[run] > longest
-    return out
-
-
-@njit(cache=True, error_model="numpy")
-def _sum_log1p(x: FloatArray, factor: FloatArray) -> FloatArray:
-    """Sums of log(1 + factor x) over x (value,) >= 0, of the shape of `factor`: products, of which one log is taken."""
-    out = np.zeros(factor.shape)
-    for i in range(factor.shape[0]):
-        for j in range(factor.shape[1]):
-            f, product, total = factor[i, j], 1.0, 0.0
-            for value in x:
-                product *= 1 + f * value
-                if product > 1e200:
-                    total += math.log(product)
-                    product = 1.0
-            out[i, j] = total + math.log(product)
     return out
 
 

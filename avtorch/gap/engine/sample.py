@@ -56,16 +56,12 @@ class Draws:
 
     `method`: "sgld"; "importance" where the density is too steep in places for Langevin steps; "laplace" where both
     fail or there is no gradient; `why` says so. `effective`: effective number of draws of the slowest coordinate.
-    `exact_share`: share of exact gradients. `widened`: largest factor on a standard deviation for what parts of the
-    drive disagree on.
     """
 
     names: tuple[str, ...]
     x: FloatArray = field(repr=False)
     method: Literal["sgld", "importance", "laplace"]
     effective: float
-    exact_share: float = 1.0
-    widened: float = 1.0
     why: str = ""
 
     def __getitem__(self, name: str) -> FloatArray:
@@ -106,18 +102,13 @@ def sample(
             why = "the surrogate's draws have no covariance"
     if found is None:
         x = normal.draws(chains * draws, rng, widen=widen).reshape(chains, draws, -1)
-        found = Draws(normal.names, x, "laplace", float(chains * draws), 0.0, why=why)
+        found = Draws(normal.names, x, "laplace", float(chains * draws), why=why)
     elif widen:
         found = replace(found, x=normal.stretched(found.x))
-    return _complete(found, h, normal.widest if widen else 1.0)
-
-
-def _complete(found: Draws, h: Hypothesis, widened: float) -> Draws:
-    """The draws with the coordinates that were held."""
-    x = np.empty((*found.x.shape[:-1], len(h.free)))
+    x = np.empty((chains, draws, len(h.free)))
     for k, name in enumerate(h.free):
         x[..., k] = found[name] if name in found.names else h[name]
-    return replace(found, names=tuple(h.free), x=x, widened=widened)
+    return replace(found, names=tuple(h.free), x=x)
 
 
 def _sampled(
@@ -136,7 +127,7 @@ def _sampled(
         z, why = _walked(target, mode, steepness, chains, draws, generator)
     if z is not None and target is not None:
         x, worth = density.constrain(z), float(effective_sample_size(z).min())
-        return Draws(density.names, x.numpy(), "sgld", worth, 1 / target.points), ""
+        return Draws(density.names, x.numpy(), "sgld", worth), ""
     weighted = weighted_draws(target or Corrected(density, surrogate, 1, 0.0), _WEIGHED, generator=generator, mode=mode)
     worth = float(weighted.effective[0])
     if worth < _FEWEST or not float(weighted.pareto_k[0]) < reliable(len(weighted.z)):

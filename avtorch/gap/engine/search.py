@@ -30,7 +30,7 @@ from avtorch.gap.engine.recorder import traded
 
 _MOST_FITS, _FEWEST_FITS = 160, 40  # of a search; a hard case of five minutes takes about fifty
 _GRID_FITS = 4e6  # fits times grid points: what a long drive may cost
-_WIDTH, _LATER_WIDTH = 9, 6  # effects fitted from the base, and from a set
+_WIDTH, _LATER_WIDTH, _SECOND_WIDTH = 9, 6, 4  # effects fitted from the base, from a set, on a second way in
 _FINISHED = 3  # of these, how many are finished
 _RAMPS = 10  # of a gain that changes, from a second to the drive's length
 _MARGIN_S = 8.0  # no onset this near to an end of the drive
@@ -42,6 +42,7 @@ _SLOPES = {
     "square_period": 0.002,
 }  # where a recorder hides a finite step
 _SLOW_MPS = 3.0
+_SHARP = ("sensor_bias", "constant_resistance", "sensor_scale")  # effects that set in at once
 
 
 class Promise(NamedTuple):
@@ -137,22 +138,29 @@ class Search:
 
     def extended(self, start: Hypothesis, another_way: bool = True) -> Hypothesis:
         """The best set that grows from `start`, by one more effect at a time."""
-        best, first = start, None
+        best, first = self._climbed(start, _WIDTH, _LATER_WIDTH, _FINISHED)
+        if another_way and self._size(best) - self._size(start) >= 2:
+            for h in first[1:]:  # a second way in, where the first needed several effects
+                if self._ended() or h.score < start.score + 3 or set(h.effects) <= set(best.effects):
+                    continue
+                best = max(best, self._climbed(h, _SECOND_WIDTH, _SECOND_WIDTH, 1)[0], key=lambda h: h.score)
+        return best
+
+    def _climbed(
+        self, start: Hypothesis, width: int, later_width: int, finished: int
+    ) -> tuple[Hypothesis, list[Hypothesis]]:
+        """The best set that grows from `start`, and the sets that were finished in the first step, the best first."""
+        best, first = start, list[Hypothesis]()
         while self._size(best) < self.most and not self._ended():
-            grown = self._grow(best, _WIDTH if best is start else _LATER_WIDTH)
+            grown = self._grow(best, width if best is start else later_width)
             if not grown:
                 break
-            grown = sorted((self._put(self._finish(h)) for h in grown[:_FINISHED]), key=lambda h: -h.score)
+            grown = sorted((self._put(self._finish(h)) for h in grown[:finished]), key=lambda h: -h.score)
             first = grown if best is start else first
             if grown[0].score < best.score:
                 break
             best = self._pruned(grown[0])
-        if another_way and first is not None and self._size(best) - self._size(start) >= 2:
-            for h in first[1:_FINISHED]:  # a second way in, where the first needed several effects
-                if self._ended() or h.score < start.score + 3 or set(h.effects) <= set(best.effects):
-                    continue
-                best = max(best, self._climbed(h), key=lambda h: h.score)
-        return best
+        return best, first
 
     def key(self, h: Hypothesis, without: str | None = None) -> tuple[tuple[str, bool], ...]:
         own = [(base_name(e), e in h.onsets) for e in h.effects if e != without]
@@ -183,25 +191,24 @@ class Search:
     def _grow(self, h: Hypothesis, width: int, iterations: int = 6) -> list[Hypothesis]:
         """The most promising sets with one more effect, fitted, the best first."""
         best: dict[str, Hypothesis] = {}
-        tried: set[str] = set()
+        fitted: set[str] = set()
 
         def better(effect: str, found: Hypothesis) -> None:
             if effect not in best or best[effect].score < found.score:
                 best[effect] = found
 
-        for promise in promises(h, self._candidates(h)):
+        for promise in promises(h, tried(h, self.effects, alone=self.alone)):
             if promise.nats < _LEAST_PROMISE or self._ended():
                 break
-            if promise.effect not in tried and len(tried) >= width:
+            if promise.effect not in fitted and len(fitted) >= width:
                 continue
-            tried.add(promise.effect)
+            fitted.add(promise.effect)
             found = self._add(h, promise.effect, promise.start, promise.onset, iterations)
-            if promise.onset is not None and EFFECTS[promise.effect].coordinates[0].name in (
-                *("sensor_bias", "resistance", "sensor_scale"),
-            ):
+            if promise.onset is not None and promise.effect in _SHARP:
                 found = refined_onset(found, promise.effect)
             better(promise.effect, self._put(found))
-            self._tell()
+            if self.progress is not None:
+                self.progress("effects", min(self.fits, self.most_fits), self.most_fits)
         if self.alone and "dead_time" in self.effects and "dead_time" not in h.effects and not self._ended():
             # other dynamics hide a delay from its promise
             better("dead_time", self._put(self._add(h, "dead_time", (0.15,), None, iterations + 4)))
@@ -211,13 +218,6 @@ class Search:
             if found is not None:
                 better("command_hold", self._put(found))
         return sorted(best.values(), key=lambda x: -x.score)
-
-    def _tell(self) -> None:
-        if self.progress is not None:
-            self.progress("effects", min(self.fits, self.most_fits), self.most_fits)
-
-    def _candidates(self, h: Hypothesis) -> list[EngineEffect]:
-        return tried(h, self.effects, alone=self.alone)
 
     def _add(
         self, h: Hypothesis, effect: str, start: Sequence[float], onset: float | None, iterations: int = 7
@@ -246,17 +246,6 @@ class Search:
             h = other_ramp(h)
         for e in list(h.onsets):
             h = refined_onset(h, e)
-        return h
-
-    def _climbed(self, h: Hypothesis) -> Hypothesis:
-        while self._size(h) < self.most and not self._ended():
-            grown = self._grow(h, 4)
-            if not grown:
-                break
-            new = self._put(self._finish(grown[0]))
-            if new.score < h.score:
-                break
-            h = self._pruned(new)
         return h
 
     def _pruned(self, h: Hypothesis, last: bool = False) -> Hypothesis:
@@ -381,7 +370,7 @@ def promises(h: Hypothesis, candidates: Sequence[EngineEffect]) -> list[Promise]
     for e in candidates:
         always: list[Promise] = []
         later: list[Promise] = []
-        for start in e.starts or _quantiles(h):
+        for start in e.starts or limit_starts(h):
             for kept in (False, True) if e.name == "dead_time" else (False,):
                 p = h.values.copy()
                 for c, x in zip(e.coordinates, start, strict=True):
@@ -486,7 +475,7 @@ def _adjoint_rows(h: Hypothesis, projection: Projection) -> list[FloatArray]:
     return out
 
 
-def _quantiles(h: Hypothesis) -> list[tuple[float, float]]:
+def limit_starts(h: Hypothesis) -> list[tuple[float, float]]:
     """Starts of both limits, from the largest commands (inverse, [s²/m])."""
     x = h["K_L"] * h.data.command
     high, low = max(float(np.percentile(x, 99.9)), 0.05), min(float(np.percentile(x, 0.1)), -0.05)

@@ -6,9 +6,9 @@ the C channels of the residual are Gaussian with the covariance
     V_fb = S_b + eps^2 G_fb,        G_fb = mean of x x' over the coefficients of the block,
 
 where x is what the effects change in the response of the bare baseline, S_b is the noise, free in every band, and eps
-is the relative error, half-normal. `shape_likelihood` maximises over S_b at each eps of a grid, `log_prior` is the
-prior on that grid, and the hypothesis's evidence takes the logarithm of the likelihood's mean under it. The maximum has
-no closed form; with A = sum_f V^-1, B = sum_f V^-1 (r r') V^-1 and # the geometric mean of matrices,
+is the relative error, half-normal. `shape_likelihood` maximises over S_b at each eps of a grid, `shape_log_prior` is
+the prior on it, and the hypothesis's evidence takes the logarithm of the likelihood's mean under it. The maximum has no
+closed form; with A = sum_f V^-1, B = sum_f V^-1 (r r') V^-1 and # the geometric mean of matrices,
 
     S <- A^-1 # (S B S)
 
@@ -58,7 +58,7 @@ def error_scale(effects: Iterable[str]) -> float:
     return SHAPE_ERROR_FOUND if _FOUND_ONE_BY_ONE in effects else SHAPE_ERROR
 
 
-def log_prior(effects: Iterable[str]) -> FloatArray:
+def shape_log_prior(effects: Iterable[str]) -> FloatArray:
     """Log prior probability (error,) of each of `RELATIVE_ERRORS` for the response of `effects`."""
     log_density = -0.5 * (np.array(RELATIVE_ERRORS) / error_scale(effects)) ** 2
     return log_density - np.log(np.exp(log_density).sum())
@@ -155,7 +155,7 @@ def _packed(energy: FloatArray, alone: float) -> FloatArray:
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _noise_beside(  # pragma: no cover - compiled
+def _noise_beside(
     observed: FloatArray, energy: FloatArray, sizes: FloatArray, errors: FloatArray, channels: int, iterations: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The noise of each band beside an error of shape: log likelihood (error, band), covariance (error, band, 3),
@@ -211,9 +211,7 @@ def _noise_beside(  # pragma: no cover - compiled
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _proper(  # pragma: no cover - compiled
-    s0: float, s1: float, s2: float, least0: float, least2: float
-) -> tuple[float, float, float]:
+def _proper(s0: float, s1: float, s2: float, least0: float, least2: float) -> tuple[float, float, float]:
     """The covariance with variances of at least `least0` and `least2`, and channels that are not quite the same."""
     s0, s2 = max(s0, least0), max(s2, least2)
     limit = _CORRELATED * math.sqrt(s0 * s2)
@@ -221,9 +219,7 @@ def _proper(  # pragma: no cover - compiled
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _geometric_mean(  # pragma: no cover - compiled
-    p0: float, p1: float, p2: float, q0: float, q1: float, q2: float
-) -> tuple[float, float, float]:
+def _geometric_mean(p0: float, p1: float, p2: float, q0: float, q1: float, q2: float) -> tuple[float, float, float]:
     """Geometric mean of two covariances of two channels, each by its elements 00, 01, 11 (Bhatia 2007, 4.1.12)."""
     p, q = math.sqrt(p0 * p2 - p1 * p1), math.sqrt(q0 * q2 - q1 * q1)
     g0, g1, g2 = p0 / p + q0 / q, p1 / p + q1 / q, p2 / p + q2 / q

@@ -39,6 +39,7 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.likelihood import band_covariance
 from avtorch.gap.engine.priors import ONSET_ODDS, SLOW_HZ
 
 # priors: log-normal, by mean and standard deviation of the logarithm
@@ -93,7 +94,7 @@ class SlowForces:
     [nats]: what either gains over it, the difference of priors included. `process_noise` [m/s³/√Hz] alone; `gust_sd`,
     `road_sd` [m/s²]; `gust_time` [s]; `road_length` [m]: the best of each grid.
 
-    `process_power`, `gust_power` (band,) [(m/s²)²] at the best gust; `covariance` (band, channel, channel) and `counts`
+    `process_power` (band,) [(m/s²)²] at the best gust; `covariance` (band, channel, channel) and `counts`
     (band,) are what was explained; `sensor` (band, channel, channel): factors by which a covariance becomes that before
     a sensor that lags or has another scale.
     """
@@ -110,7 +111,6 @@ class SlowForces:
     road_sd: float
     road_length: float
     process_power: FloatArray = field(repr=False)
-    gust_power: FloatArray = field(repr=False)
     covariance: FloatArray = field(repr=False)
     counts: FloatArray = field(repr=False)
     sensor: FloatArray = field(repr=False)
@@ -161,19 +161,6 @@ def band_response(data: DriveData) -> BandResponse:
         steps = np.diff(tones, prepend=tones[0], append=tones[-1])
         data.cache["slow_band_response"] = BandResponse(tones, energy.T * 0.5 * (steps[1:] + steps[:-1]))
     return data.cache["slow_band_response"]
-
-
-def band_covariance(
-    data: DriveData, residual: FloatArray, frames: slice | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Mean products (band, channel, channel) of residuals (channel, frame, bin), and coefficients a channel (band,).
-
-    `frames`: of these frames only.
-    """
-    part = residual if frames is None else residual[:, frames]
-    products = np.einsum("ifk,jfk->ijk", part, part)
-    counts = np.diff(data.band_edges) * float(part.shape[1])
-    return np.moveaxis(np.add.reduceat(products, data.band_edges[:-1], axis=-1) / counts, -1, 0), counts
 
 
 # likelihoods of a common power ----------------------------------------------------------------------------------------
@@ -302,7 +289,7 @@ def slow_forces(
     """
     frequency, energy = band_response(data)
     bands = len(energy)
-    covariance, counts = band_covariance(data, residual) if given is None else given
+    covariance, counts = (band_covariance(data, residual), data.band_size) if given is None else given
     sensor = _before_the_sensor(data, values, bands)
     covariance, counts = np.ascontiguousarray(covariance[:bands] * sensor), np.asarray(counts[:bands], float)
 
@@ -356,7 +343,6 @@ def slow_forces(
         road_sd=float(SIZE_GRID_MPS2[r1]),
         road_length=float(ROAD_LENGTH_GRID_M[r2]),
         process_power=process[g0],
-        gust_power=SIZE_GRID_MPS2[g1] ** 2 * gusts[g2],
         covariance=covariance,
         counts=counts,
         sensor=sensor,

@@ -22,7 +22,8 @@ from torch import Tensor
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import INDEX
-from avtorch.gap.engine.density import HypothesisDensity, WithScore, log_prior, of_products, pairs
+from avtorch.gap.engine.density import HypothesisDensity, WithScore, of_products, pairs
+from avtorch.gap.engine.evidence import log_prior
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ Where a user's own effect or baseline takes part, the simulator responds as a wh
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.gap.effects import DrivelineOscillation
-from avtorch.gap.engine.car import plant_of, table_effect
+from avtorch.gap.engine.car import drives_of, plant_of, table_effect
 from avtorch.gap.engine.compiled_plant import _FREE_DAMPING
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, NEUTRAL, Coordinate, base_name
 from avtorch.gap.engine.hypothesis import Hypothesis
@@ -200,15 +200,6 @@ class TorchPlant:
             own |= {k: torch.where(acts, own[k], x) for k, x in neutral.items() if k in own}
         rest = {k: x[..., None] for k, x in effect.values().items() if k not in own}
         return effect.replaced(rest | own)
-
-
-def drives_of(h: Hypothesis) -> Iterator[SimulatorInput]:
-    """The stretches of a hypothesis's drives as the simulator's inputs, on the grid."""
-    grid, command = h.data.grid, h.command()[h.data.grid.row]
-    for i, j in pairwise([*np.flatnonzero(grid.starts).tolist(), len(grid.time)]):
-        speed = None if h.data.speed is None else torch.as_tensor(grid.speed[i:j])
-        time, sent = torch.as_tensor(grid.time[i:j]), torch.as_tensor(command[i:j])
-        yield SimulatorInput(time, sent, speed, float(grid.accel0[i]), h.data.accel_kind == "specific-force")
 
 
 def _acting(h: Hypothesis) -> list[str]:

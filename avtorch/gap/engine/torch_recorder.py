@@ -113,7 +113,7 @@ class _OnePole(torch.autograd.Function):
 
 
 @njit(cache=True, error_model="numpy")
-def _adjoint(  # pragma: no cover - compiled
+def _adjoint(
     g: FloatArray,
     x: FloatArray,
     y: FloatArray,
@@ -150,19 +150,8 @@ class _Transform(torch.autograd.Function):
         return torch.as_tensor(flat).reshape(*rows.shape[:-1], *flat.shape[1:])
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return cast(Tensor, _Adjoint.apply(gradient, ctx.data)), None
-
-
-class _Adjoint(torch.autograd.Function):
-    """Coefficients (..., frame, bin) as rows (..., row), the transpose of `_Transform`."""
-
-    @staticmethod
-    def forward(ctx: Any, coefficients: Tensor, data: DriveData) -> Tensor:
-        ctx.data = data
-        flat = coefficients.detach().reshape(-1, *coefficients.shape[-2:]).numpy()
-        return torch.as_tensor(np.stack([data.adjoint(x) for x in flat])).reshape(*coefficients.shape[:-2], -1)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return cast(Tensor, _Transform.apply(gradient, ctx.data)), None
+        flat = gradient.reshape(-1, *gradient.shape[-2:]).numpy()
+        rows = np.stack([ctx.data.adjoint(x) for x in flat])
+        return torch.as_tensor(rows).reshape(*gradient.shape[:-2], -1), None

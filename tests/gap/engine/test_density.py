@@ -14,9 +14,8 @@ from avtorch.errors import InputError
 from avtorch.gap import DeadTime, Effect, Parameter, plant
 from avtorch.gap.engine.car import neutral_of
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, adopt
-from avtorch.gap.engine.density import HypothesisDensity, log_prior
+from avtorch.gap.engine.density import HypothesisDensity
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.evidence import log_prior_density
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.torch_plant import TorchPlant, not_in_torch
 from avtorch.inference.density import Density, ScoredDensity
@@ -163,14 +162,6 @@ def test_an_actuator_that_changes_twice_is_refused():
     h = a_hypothesis(("second_order_actuator", "rate_limit"), onset="rate_limit")
     with pytest.raises(InputError, match="rate_limit"):
         HypothesisDensity(h)
-
-
-# the prior ------------------------------------------------------------------------------------------------------------
-def test_the_prior_is_the_evidences():
-    h = a_hypothesis(tuple(e for e in VALUES))
-    names = [n for n in h.free if n != "dead_time"]
-    x = torch.as_tensor(h.values[[INDEX[n] for n in names]])
-    assert float(log_prior(h, names, x)) == pytest.approx(log_prior_density(h), rel=1e-12)
 
 
 # the gradient ---------------------------------------------------------------------------------------------------------

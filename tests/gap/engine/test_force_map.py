@@ -24,6 +24,7 @@ from avtorch.gap.engine.gauss_newton import force_columns, linearised
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.inference import Inference, infer
 from avtorch.gap.engine.recorder import base_fit
+from avtorch.gap.engine.search import tried
 from avtorch.gap.result.hypotheses import map_size
 from avtorch.io import Log
 from tests.gap.cars import log_of
@@ -168,7 +169,7 @@ def test_a_bent_command_is_worth_a_map() -> None:
 def test_what_a_map_takes_up_is_not_tried_beside_it() -> None:
     search = found().search
     (base,) = (h for h in search.map_bases if h.force is not None and h.force.name == "F(u, v)")
-    plain, mapped = ({e.name for e in search._candidates(h)} for h in (search.base, base))
+    plain, mapped = ({e.name for e in tried(h, search.effects)} for h in (search.base, base))
     assert plain - mapped == {"constant_resistance"}
     assert not {e for h in search.visited.values() if h.force is not None for e in h.effects} & set(CURVES)
 

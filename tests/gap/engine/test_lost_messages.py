@@ -176,10 +176,8 @@ def test_lost_stretches_are_found_where_they_are(rotating_seed: int) -> None:
     h = _losing(rotating_seed)
     found = lost_messages(h)
     assert isinstance(found, LostMessages)
-    assert found.count == len(LOST)
+    assert len(found.rows) == len(LOST)
     assert _at_their_places(h, found.rows)
-    assert found.fraction == pytest.approx(sum(j - i for i, j in found.rows) / 4000)
-    assert found.mean_length_s == pytest.approx(DT * found.fraction * 4000 / found.count)
 
 
 @pytest.mark.statistical

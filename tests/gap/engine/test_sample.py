@@ -91,11 +91,12 @@ def test_intervals_cover_what_halves_disagree_on():
         assert abs(alone["K_L"] - h["K_L"]) < 1.65 * sd
     draws = sample(h, chains=1, draws=4000, method="laplace")
     assert draws["K_L"].std() == pytest.approx(sd, rel=0.1)
-    assert draws.widened > 2
+    assert sd > 2 * plain
 
 
 def test_a_car_that_stays_the_same_is_not_widened():
-    assert Laplace.of(a_fit("sensor_bias", 120.0)).widest < 1.5
+    normal = Laplace.of(a_fit("sensor_bias", 120.0))
+    assert np.all(np.diag(normal.widened) < 1.5**2 * np.diag(normal.covariance))
 
 
 def test_a_limit_out_of_reach_stays():

@@ -18,10 +18,10 @@ from avtorch.gap.engine.shape_error import (
     _geometric_mean,
     effect_energy,
     frame_energy,
-    log_prior,
     relative_size,
     shape_likelihood,
     shape_log_odds,
+    shape_log_prior,
 )
 
 CHANNELS = [("accel", "speed"), ("speed",)]
@@ -50,13 +50,13 @@ def _burst(data: DriveData) -> FloatArray:
 
 @pytest.mark.parametrize("effects", [[], ["rate_limit"], ["command_hold", "gust"]])
 def test_prior_of_errors_is_a_decreasing_probability(effects: list[str]) -> None:
-    prior = log_prior(effects)
+    prior = shape_log_prior(effects)
     assert np.exp(prior).sum() == pytest.approx(1.0)
     assert (np.diff(prior) < 0).all()
 
 
 def test_messages_found_one_by_one_may_be_wrong_by_more() -> None:
-    assert log_prior(["command_hold"])[-1] > log_prior(["dead_time"])[-1] + 1.0
+    assert shape_log_prior(["command_hold"])[-1] > shape_log_prior(["dead_time"])[-1] + 1.0
 
 
 @both
