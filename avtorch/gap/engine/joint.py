@@ -6,7 +6,8 @@ Both sides share lag, gain, dead time, effects and the free forms z of every fam
 the car does on both sides, in the table or not, is no change. Each side has a recorder and a noise of its own, free in
 every band. A change delta is a lag, gain or dead time of its own on the side after, an effect on one side alone, or
 other parameters there of one that both share. A free form fits a shared effect but roughly, and what is left of it
-looks like a change: so effects of both sides compete with those of one. Free forms are orthogonal to the shared parameters, in units of the noise, so that lag and gain stay what they are without.
+looks like a change: so effects of both sides compete with those of one. Free forms are orthogonal to the shared
+parameters, in units of the noise, so that lag and gain stay what they are without.
 
 A difference that comes and goes within one side is no change between them. The blocks of a drive tell how much an
 estimate scatters, the halves of either side how much the car drifts; where that is more than the likelihood says, the
