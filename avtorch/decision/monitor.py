@@ -215,18 +215,14 @@ class Monitor:
         self._mean = (torch.where(excited, mean[0], self._mean[0]), torch.where(excited, mean[1], self._mean[1]))
         return report
 
-    def accept(self, where: Tensor, T_L: Tensor | None = None, K_L: Tensor | None = None) -> None:
+    def accept(self, where: Tensor) -> None:
         """Make the present state the new baseline in the scenarios `where` (scenario,) bool, after it was accepted or
         acted on.
 
-        The accepted values become T_L [s], K_L [-] (scenario,), by default the means of the last excited window; the
-        baseline becomes that window's posterior and the charts start afresh.
+        The accepted values become the means of the last excited window; the baseline becomes that window's posterior
+        and the charts start afresh.
         """
-        new = (self._mean[0] if T_L is None else T_L, self._mean[1] if K_L is None else K_L)
-        T, K = (
-            torch.where(where, torch.as_tensor(n, dtype=torch.float64), old)
-            for n, old in zip(new, self.accepted, strict=True)
-        )
+        T, K = (torch.where(where, new, old) for new, old in zip(self._mean, self.accepted, strict=True))
         self.accepted = (T, K)
         self._baseline = _choose(where, self._window, self._baseline)
         self._has_baseline = self._has_baseline | where

@@ -183,7 +183,9 @@ class Supervisor:
         if len(asked) == 0:
             return
         T_L, K_L = (watched.window.belief.draws[:, asked, i].mT for i in range(2))
-        gap_now = _time_gap_now(loop, self.setting)
+        # the time gap may be on its way to the setting's
+        at = getattr(loop.controller, "time_gap_at", None)
+        gap_now = self.setting.time_gap if at is None else at(loop.time).expand(loop.scenarios)
         lower = loop.lower_level
         decision = self.strategist.decide(
             T_L,
@@ -201,24 +203,26 @@ class Supervisor:
         if bool(changed.any()):
             new = decision.setting
             self._order(self._ordered.map(lambda name, old: old.index_put((asked,), getattr(new, name))))
-        truth = _truth(loop)
+        gains: list[float | None] = [None] * len(asked)
+        if isinstance(loop.plant, GLVDPlant):
+            truth = (
+                torch.as_tensor(x, dtype=torch.float64).expand(loop.scenarios)[asked]
+                for x in (loop.plant.T_L, loop.plant.K_L)
+            )
+            gains = decision.setting.peak_gain(*truth, link_delay=loop.link_delay).tolist()
         for j, i in enumerate(asked.tolist()):
             if not bool(changed[j]):
                 continue
-            chosen = decision.setting[j : j + 1]
-            gain = None
-            if truth is not None:
-                gain = float(chosen.peak_gain(truth[0][i], truth[1][i], link_delay=loop.link_delay)[0])
             waits = int(self._due[i]) - loop.steps_done if int(self._due[i]) < _NEVER else 0
             actions[i].append(
                 Action(
                     loop.time,
                     sorted(decision.strategies[j]),
-                    chosen,
+                    decision.setting[j : j + 1],
                     decision.why[j],
                     bool(decision.sufficient[j]),
                     float(decision.p_string_stable[j]),
-                    gain,
+                    gains[j],
                     waits * loop.dt,
                 )
             )
@@ -285,21 +289,6 @@ def read_setting(loop: ClosedLoop) -> Setting:
     gap = controller.time_gap  # type: ignore[attr-defined]
     k_f = getattr(controller, "feedforward", 0.0)
     return Setting(lower.T_hat, lower.K_hat, lower.T_d, lower.K_d, gap, gains, k_f, scenarios=loop.scenarios)
-
-
-def _truth(loop: ClosedLoop) -> tuple[Tensor, Tensor] | None:
-    """The vehicle's true (T_L [s], K_L [-]), each (scenario,), where the plant is a GLVD."""
-    if not isinstance(loop.plant, GLVDPlant):
-        return None
-    pair = (torch.as_tensor(x, dtype=torch.float64).expand(loop.scenarios) for x in (loop.plant.T_L, loop.plant.K_L))
-    T, K = pair
-    return T, K
-
-
-def _time_gap_now(loop: ClosedLoop, setting: Setting) -> Tensor:
-    """The time gap in force [s], (scenario,), on its way to the setting's."""
-    at = getattr(loop.controller, "time_gap_at", None)
-    return setting.time_gap if at is None else at(loop.time).expand(loop.scenarios)
 
 
 def _check_reach(strategist: Strategist, loop: ClosedLoop) -> None:

@@ -49,43 +49,32 @@ class Watched:
         return torch.where((self.start >= CHANGE_S - 1e-6)[:, None], after, before)[:, None]
 
     def rows(self, seed: int) -> list[ClaimRow]:
-        after = self.start >= CHANGE_S - 1e-6
-        off = (self.mean - self.truth).abs()
-        seen_before, seen_after = self.used & ~after[:, None], self.used & after[:, None]
-        out: list[ClaimRow] = []
-        for name, column in (("T_L", 0), ("K_L", 1)):
-            size, level = off[..., column], self.mean[..., column]
-            out.append(self._row(name, column, "before the change", seen_before, _last(seen_before), size, level, seed))
-            first = seen_after.int().argmax(0)
-            out.append(self._row(name, column, "in the first window after", seen_after, first, size, level, seed))
-            out.append(self._row(name, column, "over all windows after", seen_after, None, size, level, seed))
+        after = (self.start >= CHANGE_S - 1e-6)[:, None]
+        before, since = self.used & ~after, self.used & after
+        last = len(before) - 1 - before.flip(0).int().argmax(0)
+        moments = (
+            ("before the change", before, last),
+            ("in the first window after", since, since.int().argmax(0)),
+            ("over all windows after", since, None),
+        )
+        out = [self._row(column, *moment, seed) for column in range(2) for moment in moments]
         return [*out, self._alert(), self._early()]
 
-    def _row(
-        self,
-        name: str,
-        column: int,
-        when: str,
-        seen: Tensor,
-        index: Tensor | None,
-        size: Tensor,
-        level: Tensor,
-        seed: int,
-    ) -> ClaimRow:
-        """`seen` (window, seed); `index` (seed,) of one window, None for the mean over those seen."""
+    def _row(self, column: int, when: str, seen: Tensor, index: Tensor | None, seed: int) -> ClaimRow:
+        """The error of T_L or K_L; `seen` (window, seed); `index` (seed,) of one window, None for the mean over those
+        seen."""
         some = seen.any(0)
         paper, truth = (
             (PAPER_BEFORE[column], HEALTHY[column]) if "before" in when else (PAPER_AFTER[column], CHANGED[column])
         )
         theirs = round(abs(paper - truth), 6)
-        unit = " [s]" if name == "T_L" else " [-]"
+        what = f"error of {('T_L [s]', 'K_L [-]')[column]}"
         setting = f"{when}, {DRIVE_S:g} s, windows of {WINDOW_S:g} s; {self.ahead.name}"
         if not bool(some.any()):
-            why = "no window was excited, so the belief is still the first prior."
-            return ClaimRow(
-                "monitoring", setting, f"error of {name}{unit}", theirs, "not known", None, "not reproduced",
-                self.ahead.with_note(why),
-            )  # fmt: skip
+            why = self.ahead.with_note("no window was excited, so the belief is still the first prior.")
+            return ClaimRow("monitoring", setting, what, theirs, "not known", None, "not reproduced", why)
+        level = self.mean[..., column]
+        size = (level - self.truth[..., column]).abs()
         if index is None:
             count = seen.sum(0).clamp_min(1)
             errors, levels = (size * seen).sum(0) / count, (level * seen).sum(0) / count
@@ -93,16 +82,13 @@ class Watched:
             errors, levels = (x.gather(0, index[None])[0] for x in (size, level))
         errors, levels = errors[some], levels[some]
         interval = median_interval(errors, seed)
-        verdict = error(theirs, interval)
-        why = (
+        why = self.ahead.with_note(
             f"the paper's {paper:g} is {theirs:.2g} off the true {truth:g}; here the median estimate is "
             f"{float(middle(levels)):.3g}, and {int((errors < theirs).sum())} of {int(some.sum())} runs with such a "
             "window are nearer than the paper."
         )
-        return ClaimRow(
-            "monitoring", setting, f"error of {name}{unit}", theirs, float(middle(errors)), interval, verdict,
-            self.ahead.with_note(why),
-        )  # fmt: skip
+        ours = float(middle(errors))
+        return ClaimRow("monitoring", setting, what, theirs, ours, interval, error(theirs, interval), why)
 
     def _alert(self) -> ClaimRow:
         timely = float((self.alert <= PAPER_ALERT_S + 1e-6).double().mean())
@@ -190,8 +176,3 @@ def _read(ahead: Ahead, run: SupervisedRun) -> Watched:
         alert=torch.tensor([min(times, default=_NEVER) for times in late]),
         early=torch.tensor([any(a.time_s <= CHANGE_S + 1e-6 for a in alerts) for alerts in run.alerts]),
     )
-
-
-def _last(seen: Tensor) -> Tensor:
-    """Index of the last window seen, (seed,)."""
-    return len(seen) - 1 - seen.flip(0).int().argmax(0)

@@ -161,7 +161,7 @@ class LinearController:
         self,
         *,
         at: float,
-        time_gap: Number | None = None,
+        time_gap: Number,
         gains: Sequence[float] | Tensor | None = None,
         feedforward: Number | None = None,
         rate: float = RAMP_RATE,
@@ -171,12 +171,10 @@ class LinearController:
         It starts from the gap in force at `at`, so a ramp may be retargeted midway. `at` later than the time of the
         call is a driver's compliance delay (gains and feed-forward change at once).
         """
-        changed = dataclasses.replace(
+        return dataclasses.replace(
             self,
             gains=self.gains if gains is None else gains,
             feedforward=self.feedforward if feedforward is None else feedforward,
+            time_gap=time_gap,
+            ramp=TimeGap(target=time_gap, start=self.time_gap_at(at), since=at, rate=rate),
         )
-        if time_gap is None:
-            return changed
-        ramp = TimeGap(target=time_gap, start=self.time_gap_at(at), since=at, rate=rate)
-        return dataclasses.replace(changed, time_gap=time_gap, ramp=ramp)

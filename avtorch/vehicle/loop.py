@@ -166,19 +166,18 @@ class ClosedLoop:
         """Whether the spacing has been zero or less so far, (scenario,) or (scenario, vehicle)."""
         return self._hit.movedim(-1, 0) if self.vehicles is not None else self._hit
 
-    def copy(self, *, candidates: int | None = None, seeds: int | Sequence[int] | Tensor | None = None) -> ClosedLoop:
+    def copy(self, *, candidates: int | None = None) -> ClosedLoop:
         """An independent loop in the same state; tensors are shared (they are never written to), so this is cheap.
 
         With `candidates=n` the state gains a leading dimension: settings of shape (candidate, 1) or (candidate,
         scenario) may then be compared under common noise, and blocks have shape (candidate, scenario, time).
-        `seeds` gives the copy its own noise: a strategist must not replay the loop's future noise.
         """
         if candidates is not None and (candidates < 1 or self.vehicles is not None):
             raise InputError(f"candidates: found {candidates}, needs 1 or more, and no platoon")
         twin = copy.copy(self)
         twin.controller, twin.plant = copy.deepcopy(self.controller), copy.deepcopy(self.plant)
         twin._link = list(self._link)
-        twin._noise = copy.copy(self._noise) if seeds is None else Noise(seeds, self.scenarios, self.vehicles)
+        twin._noise = copy.copy(self._noise)
         if candidates is not None:
             for name in ("_x", "_v", "_a", "_hit"):
                 state = getattr(self, name)

@@ -82,12 +82,12 @@ class MPC:
         if q.shape != (4,) or float(q[3]) <= 0:
             raise InputError(f"weights: found {tuple(weights)!r}, needs q_s, q_v, q_a >= 0 and r > 0")
         self.accel_min, self.accel_max = float(accel_min), float(accel_max)
-        self.T_hat, self.K_hat, self.moves, self.weights = lag, gain, moves, q
+        self.T_hat, self.K_hat, self.moves, self.weights = lag, gain, moves, tuple(map(float, q))
         self.ramp: TimeGap | None = None
         self._condense()
 
     def _condense(self) -> None:
-        moves, q = self.moves, self.weights
+        moves, q = self.moves, torch.tensor(self.weights, dtype=torch.float64)
         tau, T, K, h = self.time_gap, self.T_hat, self.K_hat, self.step
         drift = torch.tensor([[0, 1, -tau, 0], [0, 0, -1, 0], [0, 0, -1 / T, K / T], [0, 0, 0, 0]], dtype=torch.float64)
         held = torch.matrix_exp(drift * h)

@@ -6,15 +6,16 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from avtorch.decision import Setting
 from avtorch.errors import InputError
 from benchmarks.detectors.operating_curves import operating_curve, operating_figure
-from benchmarks.options.gap_figure import gap_figure
-from benchmarks.options.trade_off import gap_trade_off
+from benchmarks.options.gap import gap_figure, gap_trade_off
 
 
 def curve():
     z = torch.randn(2, 100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    return gap_trade_off(1.5 * (0.05 * z[0]).exp(), 0.5 * (0.02 * z[1]).exp(), [1.0, 1.6, 2.0, 2.5])
+    gaps = torch.tensor([1.0, 1.6, 2.0, 2.5], dtype=torch.float64)
+    return gap_trade_off(1.5 * (0.05 * z[0]).exp(), 0.5 * (0.02 * z[1]).exp(), gaps, Setting())
 
 
 def test_the_curves_are_the_figures() -> None:
@@ -24,6 +25,7 @@ def test_the_curves_are_the_figures() -> None:
     assert probability.lines[0].get_ydata().tolist() == worn.p_string_stable.tolist()
     assert peak.lines[0].get_ydata().tolist() == worn.peak_gain[1].tolist()
     assert flow.lines[0].get_ydata().tolist() == worn.throughput_vph.tolist()
+    assert worn.least_gap() == 2.5
     assert "1.6 s: 1818" in [t.get_text() for t in flow.texts]
 
 
