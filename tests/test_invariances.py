@@ -295,7 +295,7 @@ def test_what_is_written_is_read_to_the_bit(suffix: str, tmp_path: Path, drive: 
 def test_no_computation_reads_the_recorders_clock() -> None:
     """`Log.time` is for people and files; all else takes `elapsed`. These may show or keep stamps."""
     shown = {
-        "decision/estimation.py", "gap/drive_record.py",
+        "decision/estimation.py",
         "gap/engine/drive_data.py", "io/quality.py",
         "live/played_log.py", "validation/windows.py",
     }  # fmt: skip

@@ -110,8 +110,7 @@ def next_experiment(
     offers = _expected(rivals[0], library(given, rate_hz=found.log.rate_hz / group), given)
     if not offers:
         raise InputError(f"limits: no manoeuvre of the library keeps to {given}; needs more speed, road or time")
-    shares = [found.probability(r.name) if r.probability is None else r.probability for r in rivals]
-    weights = np.maximum(np.array(shares), 1e-3)
+    weights = np.maximum([found.probability(r.name) for r in rivals], 1e-3)
     weights = weights / weights.sum()
     entropy = float(-(weights * np.log(weights)).sum())
     step, of = called(progress), len(rivals) + len(offers)

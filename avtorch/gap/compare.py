@@ -281,21 +281,14 @@ def _gaps(
         weights = np.concatenate([np.ones((1, len(blocks))), weights])
         drawn.append({name: np.sqrt(weights @ x / (weights @ rows)) for name, x in squares.items()})
     return {
-        name: Change(
-            *(
-                Quantity.of_resampled(x[0], x[1:])
-                for x in (drawn[0][name], drawn[1][name], drawn[1][name] / drawn[0][name])
-            )
-        )
-        for name in drawn[0]
+        name: Change(*(Quantity.of_resampled(x[0], x[1:]) for x in (before, drawn[1][name], drawn[1][name] / before)))
+        for name, before in drawn[0].items()
     }
 
 
 def _simulator_change(gap: Mapping[str, Change]) -> SimulatorChange:
-    closer, farther = (
-        any(moved.ratio.q95 < 1 for moved in gap.values()),
-        any(moved.ratio.q05 > 1 for moved in gap.values()),
-    )
+    ratios = [moved.ratio for moved in gap.values()]
+    closer, farther = any(r.q95 < 1 for r in ratios), any(r.q05 > 1 for r in ratios)
     return "inconclusive" if closer == farther else "closer" if closer else "farther"
 
 

@@ -43,7 +43,7 @@ def test_wrong_arguments_are_refused() -> None:
     log = _drive("sensor_bias")
     with pytest.raises(InputError, match="posterior"):
         avtorch.diagnose(log, posterior="guess")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="accel_kind"):
+    with pytest.raises(InputError, match="accel_kind: found 'gravity'"):
         avtorch.diagnose(log, accel_kind="gravity")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="no_such"):
         avtorch.diagnose(log, effects=["no_such"])

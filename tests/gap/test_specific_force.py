@@ -72,5 +72,3 @@ def test_the_kind_travels_with_the_log() -> None:
     assert SimulatorInput.from_log(log).specific_force
     with pytest.raises(InputError, match="different kinds of accel"):
         Record.of([log, replace(log, accel_kind="kinematic")])
-    with pytest.raises(InputError, match="accel_kind: found 'gravity'"):
-        avtorch.diagnose(log, accel_kind="gravity")  # type: ignore[arg-type]

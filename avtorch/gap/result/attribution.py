@@ -132,24 +132,19 @@ def _stretches(attribution: RowAttribution, onset_s: float | None, lag: float) -
     if "speed" in record.channels:
         axes.append(("speed", record.measured[-1].mean(-1)))
     # the command filtered by the lag: an effect of the command is visible once the actuator has followed
-    share = -np.expm1(-record.dt / lag)
-    command = np.asarray(lfilter([share], [1, share - 1], record.command))
+    follows = -np.expm1(-record.dt / lag)
+    command = np.asarray(lfilter([follows], [1, follows - 1], record.command))
     axes.append(("command", command))
     since = time >= onset_s if onset_s is not None and one_clock else np.ones(len(time), bool)
     for axis, x in axes:
         # weighted by size, not by square, or the edges of the active region would be lost
         low, high = shortest(x, np.sqrt(does), _MOST)
         if ((x >= low) & (x <= high))[since].mean() <= PLAINLY:
-            part = _part(attribution, axis, x, low, high, does)
-            yield part if axis != "command" else (axis, *_own_ends(x, low, high, record.command), *part[3:])
-
-
-def _own_ends(x: FloatArray, low: float, high: float, command: FloatArray) -> tuple[float, float]:
-    """`low` and `high` of a filtered command `x`; an end at the range's limit becomes that of the raw `command`."""
-    return (
-        float(command.min()) if low <= x.min() + 1e-9 else low,
-        float(command.max()) if high >= x.max() - 1e-9 else high,
-    )
+            _, _, _, share, gain = _part(attribution, axis, x, low, high, does)
+            if axis == "command":  # an end at the limit of the filtered command is at that of the command itself
+                low = float(record.command.min()) if low <= x.min() + 1e-9 else low
+                high = float(record.command.max()) if high >= x.max() - 1e-9 else high
+            yield axis, low, high, share, gain
 
 
 def _part(attribution: RowAttribution, axis: Axis, x: FloatArray, low: float, high: float, does: FloatArray) -> Part:

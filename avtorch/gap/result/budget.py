@@ -20,6 +20,7 @@ LIKELY = 0.5
 """Probability from which a part is named."""
 Axis = Literal["time", "speed", "command", "frequency", "signal"]
 
+_UNNAMED = "a force of command and speed without a name"
 UNITS: dict[Axis, str] = {"time": "s", "speed": "m/s", "command": "m/s²", "frequency": "Hz", "signal": ""}
 
 
@@ -244,19 +245,14 @@ class Budget:
 
     def __str__(self) -> str:
         """What a person reads first."""
-        if not self.names:
-            carried, rest = self._carried(), self.unexplained.rest(self.material)
-            if self.unexplained.material:
-                but = f", but {carried} takes off {percent(self._takes_off)} of it" if carried else ""
-                return f"No known effect explains the gap{but}."
-            if carried:
-                return f"No known effect is missing; {carried} takes off {percent(self._takes_off)} of the gap."
-            return (
-                "Nothing material is missing."
-                if rest == "noise"
-                else f"No known effect is missing; the error is {rest}."
-            )
-        return self._sentence(lead="")
+        if self.names:
+            return self._sentence(lead="")
+        takes_off, rest = f"{_UNNAMED} takes off {percent(self._takes_off)} of", self.unexplained.rest(self.material)
+        if self.unexplained.material:
+            return f"No known effect explains the gap{f', but {takes_off} it' if self._takes_off else ''}."
+        if not self._takes_off and rest == "noise":
+            return "Nothing material is missing."
+        return f"No known effect is missing; {f'{takes_off} the gap' if self._takes_off else f'the error is {rest}'}."
 
     def beside_its_name(self) -> str:
         """As `str()`, where the sentence before has told the one part that is named."""
@@ -285,8 +281,8 @@ class Budget:
         lines = []
         if lead:
             lines, shares = [lead], []
-        if self._carried() and (named or self.unexplained.material):
-            shares.append((self._takes_off, f"{self._carried()} ({percent(self._takes_off)} of the gap)"))
+        if self._takes_off and (named or self.unexplained.material):
+            shares.append((self._takes_off, f"{_UNNAMED} ({percent(self._takes_off)} of the gap)"))
         words = [said for _, said in sorted(shares, key=lambda x: -x[0])]
         if words:
             lines.append(f"{'' if lead else 'chiefly '}{', then '.join(words)}")
@@ -304,12 +300,9 @@ class Budget:
 
     @property
     def _takes_off(self) -> float:
-        """What of the gap the repaired simulator takes off without a name."""
-        return 0.0 if self.unexplained.carried is None else self.unexplained.carried.mean
-
-    def _carried(self) -> str:
-        """The force without a name in the repaired simulator in words; empty where it does nothing."""
-        return "a force of command and speed without a name" if self._takes_off >= 0.005 else ""
+        """What of the gap the repaired simulator takes off without a name; 0 where that is next to nothing."""
+        carried = self.unexplained.carried
+        return 0.0 if carried is None or carried.mean < 0.005 else carried.mean
 
     def to_dict(self) -> dict[str, Any]:
         """The object `budget` of `diagnosis.json`."""

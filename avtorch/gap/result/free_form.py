@@ -25,6 +25,7 @@ from typing import NamedTuple, Self
 import numpy as np
 import torch
 from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.linalg import block_diag
 from scipy.signal import lfilter
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
@@ -282,11 +283,7 @@ class Prior:
                 blocks.append(np.linalg.inv(whole + slack * np.eye(len(whole))))
         blocks += [np.array([[GAIN_SD**-2]]), np.array([[car.lag[1] ** -2]])]
         self.moves = np.array([*moves, True, True])
-        n = sum(len(b) for b in blocks)
-        self.precision, at = np.zeros((n, n)), 0
-        for b in blocks:
-            self.precision[at : at + len(b), at : at + len(b)] = b
-            at += len(b)
+        self.precision = np.asarray(block_diag(*blocks), np.float64)
         self.mean = np.zeros(len(self.moves))
         self.mean[-1] = car.lag[0]
 
@@ -377,6 +374,11 @@ class LeftOut:
         each = [(w, label[block] == k) for w, label in enumerate(labels) for k in np.unique(label)]
         each = [(w, told) for w, told in each if told.any() and not told.all()]
         return cls(np.array([t for _, t in each]), np.array([w for w, _ in each])) if len(each) > 2 else None
+
+    def squares(self, errors: Sequence[FloatArray], runs: Runs) -> FloatArray:
+        """Sums of squared errors (fold,) of the told runs, each fold's of its own `errors` (error,)."""
+        each = zip(errors, self.told, strict=True)
+        return np.array([float((e[told[runs.of_run]] ** 2).sum()) for e, told in each])
 
     def worse(self, squares: FloatArray, over: FloatArray) -> float:
         """Log ratio of the summed squares (fold, ...) of told runs over those of the baseline, by the worse way."""
@@ -515,8 +517,7 @@ def fitted_form(h: Hypothesis, baseline: GapPlant | None, bare: Hypothesis) -> F
     over = squares_of(Fit(base, base.zero, cut=True), Prior(base, Sizes(0.0, 0.0)), left, independent)
 
     def as_it_is(car: Car) -> float:
-        errors = drive(car, car.zero, cut=True)[0]
-        return left.worse(np.array([_sum_told(errors, runs, told) for told in left.told]), over)
+        return left.worse(left.squares([drive(car, car.zero, cut=True)[0]] * len(left.told), runs), over)
 
     best = best_form(car, left, over, independent)
     x, sizes = best.fit.x, best.sizes
@@ -541,9 +542,7 @@ def _as_a_plant(h: Hypothesis) -> Hypothesis:
 def squares_of(fit: Fit, prior: Prior, left: LeftOut, independent: float) -> FloatArray:
     """Sums of squared errors (fold,) of the told runs, driven with what the other runs of each fold teach."""
     steps = Products(fit, left).steps(prior, independent)
-    runs = fit.runs
-    errors = (drive(fit.car, fit.x + d, cut=True)[0] for d in steps)
-    return np.array([_sum_told(e, runs, told) for e, told in zip(errors, left.told, strict=True)])
+    return left.squares([drive(fit.car, fit.x + d, cut=True)[0] for d in steps], fit.runs)
 
 
 class Best(NamedTuple):
@@ -577,7 +576,3 @@ def best_form(car: Car, left: LeftOut, over: FloatArray, independent: float, tri
         told = squares_of(Fit(car, fit.x, cut=True), Prior(car, sizes), left, independent)
         found.append(Best(left.worse(told, over) + 2 * sizes.nats / independent, sizes, fit))
     return min(found, key=lambda best: best.score)
-
-
-def _sum_told(errors: FloatArray, runs: Runs, told: BoolArray) -> float:
-    return float((errors[told[runs.of_run]] ** 2).sum())

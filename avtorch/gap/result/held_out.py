@@ -50,12 +50,11 @@ class Scores:
 class HeldOut:
     """A chain of nested hypotheses on blocks that taught neither their parameters nor their noise.
 
-    `rival`: of the last hypothesis with that black box alone.
-    `steps`: scores of each hypothesis of `chain`, then of the last one with the `free` form, if there is one; `floor`,
-    `ceiling`: of the last and the first hypothesis with a black box on top (`black_box_rest`), the floor no higher than
-    the last step. `possible` (draw, channel, block): squares of free runs of what the black box may have missed.
-    `horizon_s` of the free runs. `apart`: of the last step without a family of causes, by its name, everything else
-    refitted.
+    `steps`: scores of each hypothesis of `chain`, then of the last one with the `free` form, if there is one; `rival`,
+    `ceiling`: of the last and the first hypothesis with a black box on top (`black_box_rest`); `floor`: the rival's, no
+    higher than the last step. `possible` (draw, channel, block): squares of free runs of what the black box may have
+    missed. `horizon_s` of the free runs. `apart`: of the last step without a family of causes, by its name, everything
+    else refitted.
     """
 
     chain: tuple[Hypothesis, ...]

@@ -424,7 +424,11 @@ def said_of_unnamed(parts: Sequence[AnswerPart], unknown: bool = False, epoch_s:
     if not own or (probability < LIKELY and not unknown):
         return ""
     part = max(own, key=lambda p: (p.size_mps2 is not None, p.probability))
-    words = f"{FORMS[part.form][1]} ({family})" if part.form in FORMS else f"the force map {part.form}"
+    words = (
+        f"{FORMS[part.form][1]} ({family})"
+        if part.form in FORMS
+        else f"the force map {part.form}, the car's force beyond K u"
+    )
     size = [] if part.size_mps2 is None else [f"{part.size_mps2.mean:.2g} m/s² in the root mean square"]
     what = ", ".join([words, *size, *(place.words(epoch_s) for place in part.where)])
     return f"{'It is most like' if unknown else 'A part without a name is'} {what} (probability {probability:.2g})."

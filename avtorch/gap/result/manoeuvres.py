@@ -90,29 +90,19 @@ def manoeuvres(traces: Traces, *, most: int = 6, named: bool = True) -> tuple[Ma
             end = min(last + round(AFTER_S / step), stretch[-1]) + 1
             found.append((float(energy[end] - energy[begin]) / whole, kind, first, last, slice(begin, end)))
     found.sort(reverse=True, key=lambda change: change[0])
-    return tuple(_answered(traces, lines, step, *each) for each in _chosen(found, most))
+    out = []
+    for share, kind, first, last, rows in _chosen(found, most):
+        change = float(traces.command[last] - traces.command[first])
+        part = {name: values[rows] for name, values in lines.items()}
+        responses = {name: _response(part["command"], values, change, step) for name, values in part.items()}
+        log = int((np.diff(traces.time[: first + 1]) < 0).sum())
+        begin, end = float(traces.time[first]), float(traces.time[last])
+        out.append(Manoeuvre(kind, log, rows, begin, end, change, share, part, responses))
+    return tuple(out)
 
 
 _Change = tuple[float, str, int, int, slice]
 """Share of the error, kind, first and last row of the change, and the rows about it."""
-
-
-def _answered(
-    traces: Traces,
-    lines: Mapping[str, FloatArray],
-    step: float,
-    share: float,
-    kind: str,
-    first: int,
-    last: int,
-    rows: slice,
-) -> Manoeuvre:
-    change = float(traces.command[last] - traces.command[first])
-    part = {name: values[rows] for name, values in lines.items()}
-    begin, end = (float(traces.time[i]) for i in (first, last))
-    responses = {name: _response(part["command"], values, change, step) for name, values in part.items()}
-    log = int((np.diff(traces.time[: first + 1]) < 0).sum())
-    return Manoeuvre(kind, log, rows, begin, end, change, share, part, responses)
 
 
 def _chosen(ranked: Sequence[_Change], most: int) -> list[_Change]:

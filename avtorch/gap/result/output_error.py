@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -76,8 +77,7 @@ class Rows(NamedTuple):
 class Runs:
     """Free runs over `rows` from row `first` (run,) to before row `end` (run,), errors counting from row `counts` on.
 
-    `named` (row,) [m/s²]: what the car does without free forms, mean over the step. `of_run` (error,): the run of each
-    error.
+    `named` (row,) [m/s²]: what the car does without free forms, mean over the step.
     """
 
     rows: Rows
@@ -85,7 +85,6 @@ class Runs:
     first: IntArray = field(repr=False)
     end: IntArray = field(repr=False)
     counts: IntArray = field(repr=False)
-    of_run: IntArray = field(repr=False)
 
     @classmethod
     def of(
@@ -110,7 +109,7 @@ class Runs:
             first.append(own)
             end.append(np.minimum(own + round(longest_s / dt), j))
         a = np.concatenate(first)
-        return cls._counted(rows, named, a, np.concatenate(end), a)
+        return cls(rows, named, a, np.concatenate(end), a)
 
     @classmethod
     def over_blocks(
@@ -124,12 +123,12 @@ class Runs:
         first = np.maximum(i - round(before_s / rows.dt), stretch)
         counts = np.maximum(i, first)
         kept = j - counts > max(2, round(_SHORTEST_S / rows.dt))
-        return cls._counted(rows, named, first[kept], j[kept], counts[kept])
+        return cls(rows, named, first[kept], j[kept], counts[kept])
 
-    @classmethod
-    def _counted(cls, rows: Rows, named: FloatArray, first: IntArray, end: IntArray, counts: IntArray) -> Runs:
-        of_run = np.repeat(np.arange(len(first)), (end - counts - 1) // rows.between)
-        return cls(rows, named, first, end, counts, of_run)
+    @cached_property
+    def of_run(self) -> IntArray:
+        """The run of each error (error,)."""
+        return np.repeat(np.arange(len(self.first)), (self.end - self.counts - 1) // self.rows.between)
 
     def drive(self, lag: float, at: Coefficients, *, slopes: bool = False) -> tuple[FloatArray, FloatArray]:
         """Errors (error,) [m/s] of all runs and, with `slopes`, their derivatives (error, coefficient)."""

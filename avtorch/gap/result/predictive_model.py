@@ -76,8 +76,7 @@ class PredictiveModel:
     """`plant` with the settings taken from the log; `belief`: draws (draw,) of its parameters by its own names.
 
     `noise`: of the log. `grade_rms`: size of an unknown road grade, None where the model has none.
-    `specific_force`: whether the log's `accel` is an accelerometer's reading. `probability`: relative to the other
-    models; None: that of the hypothesis of this name.
+    `specific_force`: whether the log's `accel` is an accelerometer's reading.
     """
 
     name: str
@@ -86,7 +85,6 @@ class PredictiveModel:
     noise: NoiseSpectrum = field(repr=False)
     grade_rms: float | None = None
     specific_force: bool = False
-    probability: float | None = None
 
     @classmethod
     def of(cls, posterior: ParameterPosterior, baseline: GapPlant | None, noise: NoiseSpectrum) -> PredictiveModel:

@@ -171,11 +171,10 @@ def shrinkage(found: Findings) -> list[str]:
 
 def moved(found: Findings) -> list[str]:
     """The change of the baseline's fit by the effect."""
-    baseline, with_it, changes = found.baseline, found.winner.moved, []
-    for name in ("T_L", "K_L"):
-        if name in with_it and name in baseline:
-            unit = " s" if name == "T_L" else ""
-            changes.append(f"{name} {baseline[name].mean:.2f} → {with_it[name].mean:.2f}{unit}")
+    changes = [
+        f"{name} {found.baseline[name].mean:.2f} → {q.mean:.2f}{' s' if name == 'T_L' else ''}"
+        for name, q in found.winner.moved.items()
+    ]
     effects = "effects" if len(found.verdict.names) > 1 else "effect"
     return [f"Baseline fitted without and with the {effects}: {', '.join(changes)}."] if changes else []
 
