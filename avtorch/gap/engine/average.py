@@ -76,13 +76,12 @@ class Composition:
 class Examined:
     """A visited `hypothesis` and what it may have beside its effects.
 
-    `exact`: its evidence with an exact shape. `outliers`: of the accelerometer, None without one. `beside` maps an
+    `outliers`: of the accelerometer, None without one. `beside` maps an
     effect to the relative size of what it adds to the others' response, and to the nats that it gains beside them.
     `mirror` [nats]: gain of linear dynamics that run backwards in time.
     """
 
     hypothesis: Hypothesis
-    exact: float
     compositions: tuple[Composition, ...]
     outliers: Outliers | None
     beside: Mapping[str, tuple[float, float]]
@@ -183,7 +182,7 @@ def examine(h: Hypothesis, search: Search) -> Examined:
             size = relative_size(data, h.covariance, h.predicted - rest.predicted, rest.effect_energy)
         beside[base_name(e)] = (min(size, 99.0), h.evidence - rest.evidence)
     outliers = sensor_outliers(h) if data.accel is not None else None
-    return Examined(h, exact, tuple(c for c in compositions if c is not None), outliers, beside, mirror)
+    return Examined(h, tuple(c for c in compositions if c is not None), outliers, beside, mirror)
 
 
 def _free_forms(h: Hypothesis, search: Search, slow: SlowForces) -> tuple[dict[str, FreeFormFit], float]:

@@ -34,8 +34,7 @@ from avtorch.gap.engine.evidence import log_prior
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import _LEAST
 from avtorch.gap.engine.priors import TEMPER
-from avtorch.gap.engine.torch_plant import SimulatorPlant, TorchPlant, torch_plant
-from avtorch.gap.engine.torch_recorder import TorchRecorder
+from avtorch.gap.engine.torch_plant import SimulatorPlant, TorchPlant, recorded, torch_plant
 
 _BLOCK = 2**18  # columns times steps of the grid at once: few enough for the processor's cache
 _EDGE = 1e-3  # a start at a limit is moved inside by this share of the knee
@@ -75,7 +74,7 @@ class HypothesisDensity:
         h = self.hypothesis
         values = {n: torch.tensor(h[n], dtype=x.dtype).expand(x.shape[:-1]) for n in h.free}
         values |= dict(zip(self.names, x.unbind(-1), strict=True))
-        return self._measured - self._recorder.response(*self._plant.on_grid(values), values)
+        return torch.as_tensor(h.data.measured) - recorded(h.data, *self._plant.on_grid(values), values)
 
     def compiled(self, x: FloatArray) -> FloatArray:
         """`log_density` of `x` (column, coordinate) by the compiled plant: (column,), without derivatives, quicker."""
@@ -167,14 +166,6 @@ class HypothesisDensity:
     @cached_property
     def _plant(self) -> TorchPlant | SimulatorPlant:
         return torch_plant(self.hypothesis)
-
-    @cached_property
-    def _recorder(self) -> TorchRecorder:
-        return TorchRecorder.of(self.hypothesis.data)
-
-    @cached_property
-    def _measured(self) -> Tensor:
-        return torch.as_tensor(self.hypothesis.data.measured)
 
     def _blocks(self, z: Tensor) -> Iterator[Tensor]:
         size = max(1, _BLOCK // len(self.hypothesis.data.grid.time))

@@ -69,7 +69,6 @@ def evaluate_evidence(h: Hypothesis) -> Hypothesis:
     h.jacobian, precision, _ = linearised(h, names)
     W = whitened_under_noise(h, h.jacobian, precision, _ROUNDS)
     h.information = W @ W.T + np.diag(precision)
-    h.claimed = claimed(h.data, h.covariance)
     first = base.plain or base
     first_claimed = claimed(first.data, first.covariance)
     h.effect_energy, h.shape, h.shape_log = None, None, np.zeros(1)
@@ -78,7 +77,7 @@ def evaluate_evidence(h: Hypothesis) -> Hypothesis:
         h.shape = shape_likelihood(h.data, h.residual, h.effect_energy)
     if h.shape is not None:
         h.shape_log = h.shape.nats + shape_log_prior(h.effects)
-    gain = min(h.claimed - first_claimed, h.log_likelihood - first.log_likelihood)
+    gain = min(claimed(h.data, h.covariance) - first_claimed, h.log_likelihood - first.log_likelihood)
     volume = len(names) * _HALF_LOG_2PI - 0.5 * float(np.linalg.slogdet(h.information)[1])
     prior = float(log_prior(h, names, torch.as_tensor(h.values[[INDEX[n] for n in names]])))
     h.evidence = gain + log_sum(h.shape_log) + prior + volume + _onset_odds(h) + _force_density(h)

@@ -27,13 +27,11 @@ RANDOM = ("gust", "road_grade", "outliers")
 
 @dataclass(frozen=True, eq=False)
 class Inference:
-    """The posterior of a car's drives: `base`, the `search` and its `average`; `alone`: judged by one channel, or below
-    `ONE_CHANNEL_HZ`."""
+    """The posterior of a car's drives: `base`, the `search` and its `average`."""
 
     base: Hypothesis
     search: Search
     average: ModelAverage
-    alone: bool
 
     @property
     def data(self) -> DriveData:
@@ -84,7 +82,7 @@ def infer(
     found = average(
         examined_sets(search), alone=alone, effects=[*named, *map(base_name, named)], most=most, prior=prior
     )
-    return Inference(search.base, search, found, alone)
+    return Inference(search.base, search, found)
 
 
 def cleaned_drives(base: Hypothesis, *, gears: bool = False) -> DriveData | None:

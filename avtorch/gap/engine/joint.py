@@ -42,6 +42,8 @@ _SCALES = {"T_L": COORDINATES["log_brake_lag"], "K_L": COORDINATES["gain_step"],
 _STARTS = {"T_L": (0.0, 0.5, -0.5), "K_L": (0.0,), "dead_time": (0.0, 0.1, -0.1)}
 _LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
 _FEWEST_FRAMES = 3
+_ROUNDS = 3  # of coefficients given the noise, noise given coefficients
+_GAINS_NATS = 0.05  # a step that gains less is the last one
 NOISE_COUNTS = 4.0
 """Coefficients that the noise of one car without free forms is worth, in each band: many forms would leave none."""
 SIZES = (0.03, 0.1, COEFFICIENT_SD)
@@ -166,7 +168,7 @@ class JointModel:
         cleaned = cleaned_drives(base)
         if cleaned is not None:
             whole = cleaned
-            base = base_fit(whole, baseline)
+            base = base_fit(whole, baseline, alone=alone)
         rows = whole.log >= logs_before
         if rows.all() or not rows.any():
             raise InputError(f"{'before' if rows.all() else 'after'}: has no stretch that is long enough")
@@ -210,7 +212,7 @@ class JointModel:
         both = list(zip(bare.sides, bare.noise, J, shapes, strict=True))
         inner = np.sum([gram(n, band_products(h.data, j, j)) for h, n, j, _ in both], axis=0)
         cross = np.sum([gram(n, band_products(h.data, j, x)) for h, n, j, x in both], axis=0)
-        taken = np.linalg.solve(inner + np.diag(self._prior(bare.coordinates)[1]), cross)
+        taken: FloatArray = np.asarray(np.linalg.solve(inner + np.diag(self._prior(bare.coordinates)[1]), cross), float)
         beyond = [s - np.tensordot(taken.T, j, 1) for s, j in zip(shapes, J, strict=True)]
         self._set_columns((beyond[0], beyond[1]))
         self.known = bare.noise
@@ -281,7 +283,6 @@ class JointModel:
         changes: tuple[Change, ...],
         x: FloatArray,
         noise: Sequence[FloatArray] | None = None,
-        rounds: int = 3,
     ) -> JointFit:
         """With the likeliest coefficients and noise at `x` (coordinate,)."""
         coordinates = self.coordinates(changes)
@@ -297,10 +298,10 @@ class JointModel:
             P[..., 1:, :1] = np.swapaxes(np.swapaxes(P[..., :1, 1:], -1, -2), 1, 2)
             sums.append(P)
         c = np.zeros(count)
-        for _ in range(rounds if count else 1):
+        for _ in range(_ROUNDS if count else 1):
             total = sum(gram(n, P) for n, P in zip(noise, sums, strict=True))
             assert isinstance(total, np.ndarray)
-            c = np.linalg.solve(total[1:, 1:] + self.sd**-2 * np.eye(count), total[1:, 0])
+            c = np.asarray(np.linalg.solve(total[1:, 1:] + self.sd**-2 * np.eye(count), total[1:, 0]), float)
             left = np.concatenate([[1.0], -c])
             noise = [noise_left(P, left, h.data, k) for P, h, k in zip(sums, sides, self.known, strict=True)]
         nats, low = (
@@ -347,7 +348,7 @@ class JointModel:
         return h.residual - np.tensordot(fit.c, self.columns[fit.sides.index(h)], 1)
 
     # fits ------------------------------------------------------------------------------------------------------------
-    def fit(self, changes: Sequence[Change], x: FloatArray, iterations: int = 8, tolerance: float = 0.05) -> JointFit:
+    def fit(self, changes: Sequence[Change], x: FloatArray, iterations: int = 8) -> JointFit:
         """Gauss-Newton from `x` (coordinate,)."""
         changes = tuple(changes)
         low, high = np.array([self.limits(c) for c in self.coordinates(changes)]).T
@@ -373,20 +374,20 @@ class JointModel:
             if better is None:
                 break
             gain, now, damping = better.objective - now.objective, better, max(damping / 10, 1e-5)
-            if gain < tolerance:
+            if gain < _GAINS_NATS:
                 break
         return now
 
-    def with_change(self, fit: JointFit, change: Change, iterations: int = 6) -> JointFit:
+    def with_change(self, fit: JointFit, change: Change) -> JointFit:
         """The best fit with one more change, from each of its starts."""
         changes = (*fit.changes, change)
-        tried = [self.fit(changes, np.concatenate([fit.x, start]), iterations) for start in change.starts]
+        tried = [self.fit(changes, np.concatenate([fit.x, start]), 6) for start in change.starts]
         if change.name == "dead_time" and not change.effect:  # what both sides had of it may be the one side's
             own = [c.name for c in fit.coordinates].index("dead_time")
             for start in (fit.x[own], 0.5 * fit.x[own]) if fit.x[own] > 0 else ():
                 x = np.append(fit.x, start)
                 x[own] -= start
-                tried.append(self.fit(changes, x, iterations))
+                tried.append(self.fit(changes, x, 6))
         return self.evaluated(max(tried, key=lambda f: f.objective))
 
     def without(self, fit: JointFit, change: Change) -> JointFit:

@@ -38,7 +38,6 @@ from avtorch.gap.engine.priors import LOST_NATS, WARM_S
 LONGEST_S = 1.4
 """Longest stretch [s]: a link that is silent for longer has timed out, and the controller with it."""
 
-_EFFECT = "command_hold"
 _SWEEPS = 6  # of conditional modes; three are enough for most drives
 _ROUNDS = 3  # of stretches given parameters, parameters given stretches
 
@@ -78,7 +77,7 @@ def with_lost_messages(h: Hypothesis, mask: BoolArray | None = None) -> Hypothes
         return None
     best: Hypothesis | None = None
     for _ in range(_ROUNDS):
-        trial = h.with_effect(_EFFECT, (), None) if best is None else best.copy()
+        trial = h.with_effect("command_hold", ()) if best is None else best.copy()
         trial.lost = found.rows
         trial = fit(trial, 6)
         evaluate_evidence(trial)

@@ -160,7 +160,7 @@ def rate_onset(times: FloatArray, first: float, last: float) -> tuple[float, flo
 
 
 def robust_innovations(
-    errors: FloatArray, bounds: IntArray, warm_rows: int, readings: FloatArray, order: int = ORDER
+    errors: FloatArray, bounds: IntArray, warm_rows: int, readings: FloatArray
 ) -> Innovations | None:
     """Autoregression of `errors` (row,) in the stretches between `bounds`, by iteratively reweighted least squares.
 
@@ -171,24 +171,24 @@ def robust_innovations(
     parts = [(int(i), int(j)) for i, j in zip(begins, bounds[1:], strict=True) if j - i >= 50]
     if not parts:
         return None
-    windows = [np.lib.stride_tricks.sliding_window_view(errors[i : j - 1], order) for i, j in parts]
-    design = np.column_stack([np.concatenate(windows), np.concatenate([errors[i + order : j] for i, j in parts])])
+    windows = [np.lib.stride_tricks.sliding_window_view(errors[i : j - 1], ORDER) for i, j in parts]
+    design = np.column_stack([np.concatenate(windows), np.concatenate([errors[i + ORDER : j] for i, j in parts])])
     weight = np.ones(len(design))
-    coefficients, residual, scale = np.zeros(order), design[:, -1], 1.0
+    coefficients, residual, scale = np.zeros(ORDER), design[:, -1], 1.0
     for _ in range(6):
         triangle = np.asarray(np.linalg.qr(design * weight[:, None], mode="r"))  # far smaller, with the same solution
-        coefficients = np.linalg.lstsq(triangle[:, :order], triangle[:, order])[0]
-        residual = design[:, order] - design[:, :order] @ coefficients
+        coefficients = np.linalg.lstsq(triangle[:, :ORDER], triangle[:, ORDER])[0]
+        residual = design[:, ORDER] - design[:, :ORDER] @ coefficients
         size = np.abs(residual)
         scale = 1.4826 * float(np.median(size)) + 1e-9
         # Student-like weights, steeper where errors are gross
         robust = np.where(size > 5 * scale, 0.2, 1.0) / (1 + size / (2 * scale))
-        past = np.convolve(size > 4 * scale, np.ones(order + 1))[: len(size)] > 0
+        past = np.convolve(size > 4 * scale, np.ones(ORDER + 1))[: len(size)] > 0
         weight = np.sqrt(robust) * np.where(past, 0.1, 1.0)
     levels = np.unique(np.round(readings, 5))
     if 2 < len(levels) < 0.05 * len(readings):
         scale = max(scale, QUANTUM_SCALE * float(np.median(np.diff(levels))))
-    rows = np.concatenate([np.arange(i + order, j) for i, j in parts])
+    rows = np.concatenate([np.arange(i + ORDER, j) for i, j in parts])
     return Innovations(residual / scale, rows, np.concatenate([[1.0], -coefficients[::-1]]), scale)
 
 
