@@ -32,7 +32,7 @@ from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.evidence import log_prior
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import _LEAST
+from avtorch.gap.engine.likelihood import LEAST
 from avtorch.gap.engine.priors import TEMPER
 from avtorch.gap.engine.torch_plant import SimulatorPlant, TorchPlant, recorded, torch_plant
 
@@ -46,7 +46,7 @@ class HypothesisDensity:
     """Log density of the free coordinates of a `hypothesis`: an `avtorch.inference.Density` of a single window.
 
     `chosen`: only these, the others are held; default all. `knee` (coordinate,): of the map between coordinates and z,
-    best a posterior standard deviation. Raises `InputError` where `not_in_torch` has a reason.
+    best a posterior standard deviation. Where `not_in_torch` has a reason there is none.
     """
 
     hypothesis: Hypothesis
@@ -55,9 +55,6 @@ class HypothesisDensity:
     knee: FloatArray | None = None
 
     windows = 1
-
-    def __post_init__(self) -> None:
-        self._plant  # noqa: B018 - raises
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -194,9 +191,9 @@ def of_products(data: DriveData, products: Tensor) -> Tensor:
     size = torch.as_tensor(data.band_size, dtype=products.dtype)
     S = products / size
     if data.channel_count == 1:
-        det = (1 + _LEAST) * S[..., 0, :]
+        det = (1 + LEAST) * S[..., 0, :]
     else:
-        more = _LEAST * (S[..., 0, :] + S[..., 2, :])
+        more = LEAST * (S[..., 0, :] + S[..., 2, :])
         det = (S[..., 0, :] + more) * (S[..., 2, :] + more) - S[..., 1, :] ** 2
     return -0.5 * (size * det.log()).sum(-1)
 

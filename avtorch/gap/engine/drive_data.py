@@ -27,6 +27,8 @@ from avtorch.gap.engine.priors import BAND_RATIO, CLAIM_HZ, FRAME_S, WARM_S
 from avtorch.io import Log
 from avtorch.io.log import AccelKind
 
+UNKNOWN_SPEED_MPS = 15.0
+"""What effects read where no speed was measured [m/s]."""
 _MOST_HZ = 100.0  # rows of faster logs are averaged: nothing above half of it is a car's
 _SMOOTH_S = 0.3  # the speed enters effects smoothed over it
 _START_S = 0.6  # over which the first acceleration is averaged
@@ -89,7 +91,7 @@ class DriveData:
     hold_phase: int = 0
     align_s: float = 0.0
     raw_accel: FloatArray | None = None
-    reference_speed: float = 15.0
+    reference_speed: float = 0.0
     # of the transform, see `_frame`
     warm_rows: int = 0
     frame_rows: int = 0
@@ -429,10 +431,9 @@ def _stretches(log: Log) -> list[slice]:
 def _smooth_speed(
     time: FloatArray, accel: FloatArray | None, speed: FloatArray | None, bounds: IntArray, dt: float
 ) -> FloatArray:
-    """The speed beside the integral of the acceleration, smoothed: corners stay sharp. 15 m/s where none was
-    measured."""
+    """The speed beside the integral of the acceleration, smoothed: corners stay sharp."""
     if speed is None:
-        return np.full(len(time), 15.0)
+        return np.full(len(time), UNKNOWN_SPEED_MPS)
     out = np.empty_like(speed)
     for i, j in itertools.pairwise(bounds):
         c = np.zeros(j - i)

@@ -32,7 +32,7 @@ from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.force_map import MAP_SIZES, MapForm, map_forms, size_log_prior
 from avtorch.gap.engine.gauss_newton import linear_priors
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import claimed, freedom, log_likelihood, log_sum, whiten
+from avtorch.gap.engine.likelihood import claimed, freedom, least_noise, log_likelihood, log_sum, whiten
 
 COEFFICIENT_SD = 0.35
 """Prior sd of a form's coefficient [of the demand; a tone's: m/s^2]: a third of what the command asks for."""
@@ -50,7 +50,6 @@ TONE_HZ = 3.0
 """Tones are searched for below [Hz]: swinging loops and controllers, not the engine or the wheels."""
 TONE_BACKGROUND_HZ = 0.25
 """Width [Hz] of the running median that is the noise around a line, at least 15 bins of the spectrum."""
-_LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
 _DELAY_STEP_S = 0.02  # of the finite difference in a delay: about the typical wandering
 _ROUNDS = 4  # of coefficients given the noise, noise given coefficients; the best is the answer
 _COURSES = 3  # of what wanders, each under the noise that the last one left
@@ -289,7 +288,7 @@ def linear_evidence(
         if integrated:
             unsure = cho_solve(factor, np.eye(len(precision)))
             spread = np.einsum("bcdkl,kl->bcd", products[..., 1:, 1:], unsure) / data.band_size[:, None, None]
-        noise += spread + _LEAST * np.trace(noise, axis1=1, axis2=2)[:, None, None] * np.eye(data.channel_count)
+        noise += spread + least_noise(noise)
         gain = min(claimed(data, noise) - before[0], claimed(data, noise, math.inf) - before[1])
         gain += 0.5 * freedom(data, noise, spread) if integrated else 0.0
         gain += float(pull @ moves - 0.5 * precision @ moves**2) - float(np.log(np.diag(factor[0])).sum())

@@ -10,13 +10,17 @@ forms are orthogonal to the shared parameters, in units of the noise, so that la
 A difference that comes and goes within one side is no change between them. The blocks of a drive tell how much an
 estimate scatters, the halves of either side how much the car drifts; where that is more than the likelihood says, the
 likelihood is tempered down to it (a sandwich in place of the information; White 1982, Chandler and Bate 2007).
+
+`search_changes`: from one car on, the promise of each change is computed to first order; the best are fitted and
+valued, and the best of them stays while it gains. Evidence, so tempered, stands against the prior odds of one more
+effect, and all visited sets are averaged.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Literal
@@ -25,22 +29,24 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.gap.engine.coordinates import COORDINATES, INDEX, Coordinate, EngineEffect
+from avtorch.gap.engine.coordinates import COORDINATES, EFFECTS, INDEX, Coordinate, EngineEffect
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.free_forms import COEFFICIENT_SD, band_products, demand_response, families, gram
 from avtorch.gap.engine.gauss_newton import jacobian, normal_prior
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.inference import cleaned_drives
-from avtorch.gap.engine.likelihood import claim_bands, claimed, whiten
-from avtorch.gap.engine.priors import ONE_CHANNEL_HZ
+from avtorch.gap.engine.likelihood import HALF_LOG_2PI, claim_bands, claimed, least_noise, log_sum, whiten
+from avtorch.gap.engine.priors import EFFECT_NATS, ONE_CHANNEL_HZ, TEMPER, UNKNOWN_NATS
 from avtorch.gap.engine.recorder import aligned, base_fit
+from avtorch.gap.engine.search import limit_starts, tried
+from avtorch.gap.engine.shape_error import effect_energy, relative_size, shape_log_odds
 from avtorch.gap.simulator.plant import GapPlant
 
+Progress = Callable[[str, int, int], None]
 Link = Literal["value", "log", "plus", "times"]
 
 _SCALES = {"T_L": COORDINATES["log_brake_lag"], "K_L": COORDINATES["gain_step"], "dead_time": COORDINATES["dead_time"]}
 _STARTS = {"T_L": (0.0, 0.5, -0.5), "K_L": (0.0,), "dead_time": (0.0, 0.1, -0.1)}
-_LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
 _FEWEST_FRAMES = 3
 _ROUNDS = 3  # of coefficients given the noise, noise given coefficients
 _GAINS_NATS = 0.05  # a step that gains less is the last one
@@ -49,9 +55,14 @@ NOISE_COUNTS = 4.0
 SIZES = (0.03, 0.1, COEFFICIENT_SD)
 """Prior standard deviations of free forms' coefficients, of which the likeliest stands [of the demand]."""
 _BLOCK_S, _FEWEST_BLOCKS = 10.0, 5
+MOST = 3
+"""Changes at once."""
+_FITTED = 6  # effects besides lag, gain and dead time
+_EFFECT_STARTS = 2  # of an effect
+_LIMIT_STARTS = 4  # of a saturation, before the promising ones are chosen
+_HELD = 0.9  # probability that an alias set holds
 NO_CHANGE = frozenset({"gain_change", "gear_shift", "command_hold", "dead_time", "~linear"})
 """What is no change of a car between drives: of one drive, of chance, or a change of T_L, K_L and dead time."""
-_HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 
 
 @dataclass(frozen=True)
@@ -405,7 +416,7 @@ class JointModel:
         for c, x, m, p in zip(fit.coordinates, fit.x, mean, precision, strict=True):
             sized = c.sized
             if sized is None:
-                gain += -0.5 * p * (x - m) ** 2 + 0.5 * math.log(p) - _HALF_LOG_2PI
+                gain += -0.5 * p * (x - m) ** 2 + 0.5 * math.log(p) - HALF_LOG_2PI
             else:
                 z = (x - m) / sized.scale
                 gain += math.log(2 / (math.pi * math.sqrt(3) * sized.scale)) - 2 * math.log1p(z * z / 3)
@@ -414,7 +425,7 @@ class JointModel:
             each = [(c.sized, fit.x[fit.coordinates.index(c)]) for c in change.coordinates]
             size = sum((x / c.faint) ** 2 for c, x in each if c is not None and c.faint)
             gain += max(-1 / max(size, 1e-9), -60.0) if any(c and c.faint for c, _ in each) else 0.0
-        volume = len(fit.x) * _HALF_LOG_2PI - 0.5 * float(np.linalg.slogdet(fit.information)[1])
+        volume = len(fit.x) * HALF_LOG_2PI - 0.5 * float(np.linalg.slogdet(fit.information)[1])
         fit.evidence = gain + volume
         return fit
 
@@ -484,8 +495,7 @@ def noise_left(products: FloatArray, left: FloatArray, data: DriveData, known: F
     count = data.band_size[:, None, None]
     S = S / count if known is None else (S + NOISE_COUNTS * known) / (count + NOISE_COUNTS)
     S = 0.5 * (S + np.swapaxes(S, 1, 2))
-    trace = np.trace(S, axis1=1, axis2=2)
-    return S + (_LEAST * trace)[:, None, None] * np.eye(data.channel_count)
+    return S + least_noise(S)
 
 
 def nats_of(data: DriveData, noise: FloatArray, known: FloatArray | None, fmax: float | None = math.inf) -> float:
@@ -495,3 +505,255 @@ def nats_of(data: DriveData, noise: FloatArray, known: FloatArray | None, fmax: 
         return nats
     n = claim_bands(data, fmax)
     return nats - 0.5 * NOISE_COUNTS * float(np.linalg.slogdet(noise[:n])[1].sum())
+
+
+# changes -------------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """How far a change's main coordinate is known: variances by the likelihood, by blocks, and of drift."""
+
+    likelihood: float
+    blocks: float
+    drift: float
+
+    @property
+    def variance(self) -> float:
+        return max(self.likelihood, self.blocks) + self.drift
+
+    @property
+    def drifts(self) -> bool:
+        """Whether halves of one side disagree more than their blocks do."""
+        return self.drift > max(self.likelihood, self.blocks)
+
+    @property
+    def temper(self) -> float:
+        return self.likelihood / self.variance
+
+
+@dataclass(frozen=True, eq=False)
+class Visited:
+    """A set of changes: its fit and `log_weight`, tempered, relative to one car."""
+
+    fit: JointFit
+    log_weight: float
+
+
+@dataclass(frozen=True, eq=False)
+class ChangePosterior:
+    """`best`: the last set; `visited`: all, by their changes. `scatter` of each change in the best.
+
+    `siblings`: names of what else may have entered where a change did. `rejected`: the strongest change of the last
+    step, which did not enter, its scatter, and its log odds [nats] if it had none. `unknown`: probability that free
+    forms differ besides.
+    """
+
+    model: JointModel
+    best: Visited
+    visited: Mapping[frozenset[tuple[str, bool]], Visited]
+    scatter: Mapping[Change, Scatter]
+    siblings: Mapping[tuple[str, bool], tuple[str, ...]]
+    rejected: tuple[JointFit, Scatter, float] | None
+    unknown: float
+
+    def probability(self, change: Change) -> float:
+        """Of a change, over all visited sets."""
+        whole = log_sum([v.log_weight for v in self.visited.values()])
+        own = [v.log_weight for key, v in self.visited.items() if change.key in key]
+        return math.exp(log_sum(own) - whole) if own else 0.0
+
+
+def candidates(model: JointModel, effects: Collection[str]) -> list[Change]:
+    """T_L, K_L, the dead time, and of `effects` those that a car may gain or lose."""
+    car = ["T_L", "K_L"] + ["dead_time"] * ("dead_time" in model.base.effects)
+    out = [of_car(name) for name in car]
+    held = {c.name for c in out} | set(model.own_effects)
+    for e in tried(model.base, effects):
+        if e.name in NO_CHANGE or e.onset == "must" or e.base in held:
+            continue
+        starts = e.starts or tuple(limit_starts(model.base)[:_LIMIT_STARTS])
+        out.append(of_effect(e, starts, less=False))
+        if e.one_sided:
+            out.append(of_effect(e, starts, less=True))
+    return out
+
+
+def search_changes(model: JointModel, changes: list[Change], progress: Progress | None = None) -> ChangePosterior:
+    """The posterior over sets of `changes`."""
+    now = Visited(model.start, 0.0)
+    visited = {frozenset[tuple[str, bool]](): now}
+    siblings: dict[tuple[str, bool], tuple[str, ...]] = {}
+    rejected = None
+    for number in range(1, MOST + 1):
+        tried = []
+        wanted = _promising(model, now.fit, [c for c in changes if c.name not in now.fit.names])
+        for done, change in enumerate(wanted):
+            if progress is not None:
+                progress(f"change {number}: {change.name}", done, len(wanted))
+            tried.append(model.with_change(now.fit, change))
+        if not tried:
+            break
+        found = max(tried, key=lambda f: f.evidence)
+        scatter = scatter_of(model, found, found.changes[-1])
+        each = [Visited(f, _weight(now, f, scatter.temper)) for f in tried]
+        for v in each:
+            visited[_key(v.fit)] = v
+        best = max(each, key=lambda v: v.log_weight)
+        chosen = _alike(each)
+        now = visited[_key(now.fit)] = _with_wrong_shape(model, now, best)
+        if best.log_weight < now.log_weight:
+            rejected = found, scatter, found.evidence - now.fit.evidence - EFFECT_NATS
+            break
+        siblings[best.fit.changes[-1].key] = chosen
+        now = best
+        for change in now.fit.changes[:-1]:
+            rest = model.without(now.fit, change)
+            other = Visited(rest, now.log_weight + scatter.temper * (rest.evidence - now.fit.evidence + EFFECT_NATS))
+            if _key(rest) not in visited:
+                visited[_key(rest)] = other
+            if other.log_weight > now.log_weight:
+                now = other
+    scatters = {c: scatter_of(model, now.fit, c) for c in now.fit.changes}
+    return ChangePosterior(model, now, visited, scatters, siblings, rejected, _unknown(model, now.fit))
+
+
+def scatter_of(model: JointModel, fit: JointFit, change: Change) -> Scatter:
+    """Of a change's largest coordinate in a fit."""
+    likelihood, blocks, drift = model.covariance(fit)
+    blocks = blocks * (model.blocks - 1) / max(model.blocks - 3, 1)  # of a variance from few blocks (Student)
+    at = max(fit.at(change), key=lambda k: abs(fit.x[k]) / math.sqrt(likelihood[k, k]))
+    return Scatter(float(likelihood[at, at]), float(blocks[at, at]), float(drift[at]))
+
+
+def lag_or_dead_time(model: JointModel) -> tuple[JointFit, float, float]:
+    """Probabilities that lag and gain alone have changed, and that the dead time alone has; the fit with all three."""
+    lag, gain, delay = map(of_car, ("T_L", "K_L", "dead_time"))
+    one = [model.with_change(model.start, change) for change in (lag, gain, delay)]
+    two = model.with_change(one[0], gain)
+    three = model.with_change(two, delay)
+    fits = [one[0], one[1], two, one[2], model.with_change(one[0], delay), model.with_change(one[1], delay), three]
+    best = max(fits, key=lambda f: f.evidence)
+    temper = min(scatter_of(model, best, change).temper for change in best.changes)
+    logs = np.array([temper * f.evidence - TEMPER * EFFECT_NATS * len(f.changes) for f in fits])
+    p = np.exp(logs - log_sum(logs))
+    return three, float(p[:3].sum()), float(p[3])
+
+
+def _key(fit: JointFit) -> frozenset[tuple[str, bool]]:
+    return frozenset(c.key for c in fit.changes)
+
+
+def _weight(now: Visited, fit: JointFit, temper: float) -> float:
+    return now.log_weight + temper * (fit.evidence - now.fit.evidence) - TEMPER * EFFECT_NATS
+
+
+def _with_wrong_shape(model: JointModel, now: Visited, best: Visited) -> Visited:
+    """A set with what another change gains beside it as far as that is an error in the shape of its own changes."""
+    if not now.fit.changes:
+        return now
+    after = not best.fit.changes[-1].less
+    data, noise = model.sides[after], best.fit.noise[after]
+    first, with_all = now.fit.sides[after].predicted, best.fit.sides[after].predicted
+    energy = effect_energy(data, first - model.start.sides[after].predicted)
+    size = relative_size(data, noise, with_all - first, energy)
+    worth = shape_log_odds(min(size, 99.0), best.fit.evidence - now.fit.evidence, ()) + EFFECT_NATS
+    return Visited(now.fit, float(np.logaddexp(now.log_weight, best.log_weight + TEMPER * worth)))
+
+
+def _alike(each: list[Visited]) -> tuple[str, ...]:
+    """Names that hold nine tenths of the probability of what was tried, the most probable first."""
+    whole, held = log_sum([v.log_weight for v in each]), 0.0
+    names: list[str] = []
+    for v in sorted(each, key=lambda v: -v.log_weight):
+        names.append(v.fit.names[-1])
+        held += math.exp(v.log_weight - whole)
+        if held > _HELD:
+            break
+    return tuple(dict.fromkeys(names))
+
+
+def _promising(model: JointModel, fit: JointFit, changes: list[Change]) -> list[Change]:
+    """Those of the car, and the effects that promise most to first order, with their best starts."""
+    found: list[tuple[float, Change, tuple[float, ...]]] = []
+    for after in (False, True):
+        own = [(c, s) for c in changes if c.effect and c.less != after for s in c.starts]
+        if not own:
+            continue
+        h, noise = fit.sides[after], fit.noise[after]
+        signals = []
+        for change, start in own:
+            both = (*fit.changes, change)
+            x = np.concatenate([fit.x, start])
+            moved = model.hypothesis(both, model.coordinates(both), x, after)
+            signals.append(moved.response() - h.predicted)
+        tried = np.array(signals)
+        base = np.concatenate([fit.derivatives[after], model.columns[after]])
+        shared = gram(noise, band_products(h.data, base, tried))
+        gains = gram(noise, band_products(h.data, model.left(fit, h)[None], tried))[0]
+        sizes = np.array([gram(noise, band_products(h.data, x[None], x[None]))[0, 0] for x in tried])
+        sizes = sizes - np.einsum("ij,ij->j", shared, np.linalg.solve(fit.information, shared))
+        for (change, start), gain, size in zip(own, gains, np.maximum(sizes, 0.0), strict=True):
+            if gain <= 0 and EFFECTS[change.effect].one_sided:
+                continue
+            if len(start) == 1:
+                scale = float(np.clip(abs(gain) / (size + 1e-9), 0.2, 4.0)) * math.copysign(1, gain)
+                start = (start[0] * scale,)
+            found.append((0.5 * float(gain) ** 2 / (float(size) + 1), change, start))
+    found.sort(key=lambda x: -x[0])
+    starts: dict[Change, list[tuple[float, ...]]] = {}
+    for _, change, start in found:
+        if len(starts) < _FITTED or change in starts:
+            starts.setdefault(change, []).append(start)
+    best = [replace(c, starts=tuple(s[:_EFFECT_STARTS])) for c, s in starts.items()]
+    return [c for c in changes if not c.effect] + best
+
+
+def _unknown(model: JointModel, fit: JointFit) -> float:
+    """Probability that the free forms differ between the sides, beyond what they do between halves of one side.
+
+    Halves are a negative control: what has as much evidence within one side is no change.
+    """
+    halves = []
+    for data in model.sides:
+        second = np.zeros(data.frame_count)
+        second[data.frame_count // 2 :] = 1.0
+        halves.append(second)
+    none = [np.zeros(len(x)) for x in halves]
+    after = _own_forms(model, fit, [none[0], np.ones(len(halves[1]))])
+    within = max(_own_forms(model, fit, [halves[0], none[1]]), _own_forms(model, fit, [none[0], halves[1]]), 0.0)
+    odds = TEMPER * (after - within - UNKNOWN_NATS)
+    return 1 / (1 + math.exp(-min(max(odds, -50.0), 50.0)))
+
+
+def _own_forms(model: JointModel, fit: JointFit, acting: list[FloatArray]) -> float:
+    """Gain [nats] of free forms with coefficients of their own in the frames `acting` (frame,) of each side."""
+    count = len(fit.c)
+    bases = [np.concatenate([j, c]) for j, c in zip(fit.derivatives, model.columns, strict=True)]
+    own = [c * a[:, None] for c, a in zip(model.columns, acting, strict=True)]
+    signals = [
+        np.concatenate([model.left(fit, h)[None], base, x]) for h, base, x in zip(fit.sides, bases, own, strict=True)
+    ]
+    P = [band_products(h.data, x, x) for h, x in zip(fit.sides, signals, strict=True)]
+    n = len(fit.information)
+    precision = fit.information - sum(
+        gram(noise, p[..., 1 : n + 1, 1 : n + 1]) for noise, p in zip(fit.noise, P, strict=True)
+    )
+    best = -math.inf
+    for sd in SIZES:
+        noise = list(fit.noise)
+        prior = np.zeros((n + count, n + count))
+        prior[:n, :n] = precision
+        prior[n:, n:] = sd**-2 * np.eye(count)
+        for _ in range(3):
+            total = sum(gram(s, p) for s, p in zip(noise, P, strict=True))
+            assert isinstance(total, np.ndarray)
+            H = total[1:, 1:] + prior
+            b = np.linalg.solve(H, total[1:, 0])
+            left = np.append(1.0, -b)
+            noise = [noise_left(p, left, h.data, k) for p, h, k in zip(P, fit.sides, model.known, strict=True)]
+        whole, low = (
+            sum(nats_of(h.data, s, k, fmax) for h, s, k in zip(fit.sides, noise, model.known, strict=True)) - before
+            for fmax, before in ((math.inf, fit.log_likelihood), (None, fit.claimed))
+        )
+        occam = -count * math.log(sd) - 0.5 * float(np.linalg.slogdet(H)[1] - np.linalg.slogdet(fit.information)[1])
+        best = max(best, min(low, whole) - 0.5 * float(b @ prior @ b) + occam)
+    return best - math.log(len(SIZES))

@@ -63,35 +63,33 @@ class Promise(NamedTuple):
 
 @dataclass(eq=False)
 class Search:
-    """A search from a fitted `base`, among `effects`; at most `most` in a set. `alone`: one channel, or the band below
-    `ONE_CHANNEL_HZ`: the car's own unnamed dynamics then belong to the base.
+    """A search from a fitted `base`, among `effects`; at most `most` in a set. With one channel the car's own unnamed
+    dynamics belong to the base.
 
-    `most_fits` bounds what it may cost (0: by the length of the drive), `stop()` ends it where it returns True;
-    `complete` tells whether one of them did. `visited` maps a set (names, and whether each has an onset; the name of
+    `most_fits` bounds what it may cost, by the length of the drive, `stop()` ends it where it returns True; `complete`
+    tells whether one of them did. `visited` maps a set (names, and whether each has an onset; the name of
     its force map) to its best hypothesis. `map_bases`: bases with a force map that sets have grown from.
     """
 
     base: Hypothesis
     effects: Collection[str] = tuple(EFFECTS)
     most: int = 4
-    alone: bool = False
-    most_fits: int = 0
     stop: Callable[[], bool] | None = None
     progress: Callable[[str, int, int], None] | None = None
     visited: dict[tuple[tuple[str, bool], ...], Hypothesis] = field(default_factory=dict)
     fits: int = 0
+    most_fits: int = field(init=False)
     complete: bool = True
     map_bases: list[Hypothesis] = field(default_factory=list)
     _shifts_refined: bool = False
 
     def __post_init__(self) -> None:
-        if not self.most_fits:
-            self.most_fits = int(np.clip(_GRID_FITS / len(self.base.data.grid.time), _FEWEST_FITS, _MOST_FITS))
+        self.most_fits = int(np.clip(_GRID_FITS / len(self.base.data.grid.time), _FEWEST_FITS, _MOST_FITS))
 
     def run(self) -> Hypothesis:
         """The best set found."""
         best = self._put(self.base)
-        if self.alone and "~linear" in self.effects:
+        if best.alone and "~linear" in self.effects:
             ways = [self._put(fit(self._add(best, "~linear", s, None, 10), 6)) for s in EFFECTS["~linear"].starts[1:]]
             free = max(ways, key=lambda h: h.score)
             if free.score > best.score:  # the car's own dynamics, without a name
@@ -204,7 +202,7 @@ class Search:
             if effect not in best or best[effect].score < found.score:
                 best[effect] = found
 
-        for promise in promises(h, tried(h, self.effects, alone=self.alone)):
+        for promise in promises(h, tried(h, self.effects)):
             if promise.nats < _LEAST_PROMISE or self._ended():
                 break
             if promise.effect not in fitted and len(fitted) >= width:
@@ -216,7 +214,7 @@ class Search:
             better(promise.effect, self._put(found))
             if self.progress is not None:
                 self.progress("effects", min(self.fits, self.most_fits), self.most_fits)
-        if self.alone and "dead_time" in self.effects and "dead_time" not in h.effects and not self._ended():
+        if h.alone and "dead_time" in self.effects and "dead_time" not in h.effects and not self._ended():
             # other dynamics hide a delay from its promise
             better("dead_time", self._put(self._add(h, "dead_time", (0.15,), None, 10)))
         if "command_hold" in self.effects and "command_hold" not in h.effects and not self._ended():
@@ -260,7 +258,7 @@ class Search:
         while h.effects and not self._ended():
             others = []
             for e in h.effects if last else h.effects[:-1]:
-                if e == "~linear" and self.alone:
+                if e == "~linear":
                     continue
                 self.fits += 1
                 others.append(self._put(fit(h.without(e), 6)))
@@ -287,8 +285,8 @@ class Search:
             yield max((self._put(self._add(rest, e, s, None)) for s in starts), key=lambda x: x.score)
 
 
-def tried(h: Hypothesis, among: Collection[str], *, alone: bool = False) -> list[EngineEffect]:
-    """The effects that may be added to `h`, those `among` which its drives can show; `alone`: with one channel."""
+def tried(h: Hypothesis, among: Collection[str]) -> list[EngineEffect]:
+    """The effects that may be added to `h`, those `among` which its drives can show."""
     data, own = h.data, {base_name(e) for e in h.effects}
     out = []
     for e in EFFECTS.values():
@@ -298,7 +296,7 @@ def tried(h: Hypothesis, among: Collection[str], *, alone: bool = False) -> list
             continue
         if h.force is not None and e.base in h.force.takes_up:
             continue
-        if e.name == "~linear" and not alone:
+        if e.name == "~linear" and not h.alone:
             continue
         if e.name == "low_speed_creep" and (data.smooth_speed < _SLOW_MPS).mean() < 0.01:
             continue

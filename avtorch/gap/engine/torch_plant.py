@@ -25,12 +25,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from avtorch.arrays import FloatArray, IntArray
-from avtorch.errors import InputError
 from avtorch.gap.effects import DrivelineOscillation
 from avtorch.gap.engine.car import drives_of, plant_of, table_effect
 from avtorch.gap.engine.compiled_plant import _FREE_DAMPING
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, NEUTRAL, Coordinate, base_name
-from avtorch.gap.engine.drive_data import DriveData, filtered
+from avtorch.gap.engine.drive_data import UNKNOWN_SPEED_MPS, DriveData, filtered
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.simulator.actuator import Actuator, Substep
 from avtorch.gap.simulator.effect import Effect
@@ -74,10 +73,7 @@ def not_in_torch(h: Hypothesis) -> str:
 
 
 def torch_plant(h: Hypothesis) -> TorchPlant | SimulatorPlant:
-    """The plant of a hypothesis. Raises `InputError` where `not_in_torch` has a reason."""
-    why = not_in_torch(h)
-    if why:
-        raise InputError(f"hypothesis: {why}, needs effects from the start")
+    """The plant of a hypothesis for which `not_in_torch` has no reason against it."""
     return SimulatorPlant.of(h) if _by_the_simulator(h) else TorchPlant.of(h)
 
 
@@ -110,50 +106,31 @@ class SimulatorPlant:
 
 
 @dataclass(frozen=True, eq=False)
-class _Stretch:
-    """Steps (grid,) of one stretch, and the car's acceleration at its first row [m/s²]."""
-
-    row: EffectContext
-    command: Tensor
-    accel0: Tensor
-
-
-@dataclass(frozen=True, eq=False)
 class TorchPlant:
     """`Hypothesis.on_grid` for tensors of values; `acting`: effects, those of the user's baseline among them."""
 
     hypothesis: Hypothesis
     acting: tuple[str, ...]
-    stretches: tuple[_Stretch, ...]
+    drives: tuple[SimulatorInput, ...]
 
     @classmethod
     def of(cls, h: Hypothesis) -> TorchPlant:
-        grid = h.data.grid
-        begins = np.flatnonzero(grid.starts).tolist()
-        command = h.command()[grid.row]
-        stretches = []
-        for i, j in zip(begins, [*begins[1:], len(grid.time)], strict=True):
-            time, none = torch.as_tensor(grid.time[i:j]), torch.zeros(1, dtype=torch.float64)
-            steps = time.diff()
-            uniform = bool((steps - steps.mean()).abs().max() <= 1e-6 * steps.mean())
-            dt = (time[-1] - time[0]) / (j - i - 1) if uniform else torch.cat([steps, steps[-1:]])
-            row = EffectContext(time, dt, torch.as_tensor(grid.speed[i:j]), None, none, none)
-            accel0 = torch.tensor(grid.accel0[i], dtype=torch.float64)
-            stretches.append(_Stretch(row, torch.as_tensor(command[i:j]), accel0))
-        return cls(h, tuple(_acting(h)), tuple(stretches))
+        return cls(h, tuple(_acting(h)), tuple(drives_of(h)))
 
     def on_grid(self, values: Values) -> tuple[Tensor, Tensor]:
         """The accelerometer's reading [m/s²] and the speed's reading gained in its stretch [m/s], (column, grid) each.
 
         `values`: every coordinate of the vector that differs from the hypothesis's, `T_L` among them.
         """
-        parts = [self._over(stretch, values) for stretch in self.stretches]
+        parts = [self._over(drive, values) for drive in self.drives]
         accel, gained = zip(*parts, strict=True)
         return torch.cat(accel, -1), torch.cat(gained, -1)
 
-    def _over(self, stretch: _Stretch, values: Values) -> tuple[Tensor, Tensor]:
-        steps, columns = len(stretch.command), values["T_L"].shape
-        row = replace(stretch.row, T_L=values["T_L"][..., None], K_L=values["K_L"][..., None])
+    def _over(self, drive: SimulatorInput, values: Values) -> tuple[Tensor, Tensor]:
+        steps, columns = len(drive.time), values["T_L"].shape
+        speed = torch.full_like(drive.time, UNKNOWN_SPEED_MPS) if drive.speed is None else drive.speed
+        dt = drive.dt[0] if drive.uniform else drive.dt
+        row = EffectContext(drive.time, dt, speed, None, values["T_L"][..., None], values["K_L"][..., None])
         late: dict[str, int] = {}
         effects = []
         for name in self.acting:
@@ -171,8 +148,8 @@ class TorchPlant:
             after = e.over(x[..., before:], rest)
             return torch.cat([x[..., :before].expand(*after.shape[:-1], -1), after], -1)
 
-        parts = substeps(chain, stretch.command, row, hook)
-        accel0, at = stretch.accel0.expand(columns), context_at(row, 0)
+        parts = substeps(chain, drive.command, row, hook)
+        accel0, at = torch.as_tensor(drive.accel0).expand(columns), context_at(row, 0)
         actuator0 = accel0
         for e in at_place(chain, "body"):  # the actuator's share is the car's acceleration less the other forces
             first = e.replaced({key: value[..., 0] for key, value in e.values().items()})
