@@ -7,6 +7,6 @@ the differenced speed (`drive_data`). D_c and F_c are a delay and a filter of th
 (`recorder`). Drives are compared in lapped coefficients, nearly independent and local in time and frequency. The
 noise's covariance is free in each band and integrated out (`likelihood`); sets of effects M are fitted
 (`gauss_newton`), valued (`evidence`), searched (`search`) and averaged (`average`). Random parts of the same evidence:
-`slow_forces`, `outliers`, `lost_messages`, `gear_shifts`; what no name explains: `force_map`, beside which sets of
-effects stand (`force_base`), `free_forms`, `shape_error`. Constants: `priors`.
+`slow_forces`, `outliers`, `lost_messages`, `gear_shifts`; what no name explains: `force_map`, `free_forms`,
+`shape_error`. Constants: `priors`.
 """

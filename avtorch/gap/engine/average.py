@@ -76,13 +76,12 @@ class Composition:
 class Examined:
     """A visited `hypothesis` and what it may have beside its effects.
 
-    `exact`: its evidence with an exact shape. `outliers`: of the accelerometer, None without one. `beside` maps an
+    `outliers`: of the accelerometer, None without one. `beside` maps an
     effect to the relative size of what it adds to the others' response, and to the nats that it gains beside them.
     `mirror` [nats]: gain of linear dynamics that run backwards in time.
     """
 
     hypothesis: Hypothesis
-    exact: float
     compositions: tuple[Composition, ...]
     outliers: Outliers | None
     beside: Mapping[str, tuple[float, float]]
@@ -158,12 +157,12 @@ def examined_sets(search: Search) -> list[Examined]:
 
 def examine(h: Hypothesis, search: Search) -> Examined:
     """Everything that may be beside the effects of one hypothesis, in nats."""
-    data, alone = h.data, search.alone
+    data = h.data
     exact = h.evidence - log_sum(h.shape_log)
     lags = pulling_lags(h)
     compositions = [_composed(h, "", 0.0, h.residual, exact, lags)]
     mirror = 0.0
-    if not alone:  # with one channel no free form can be told from the base's own dynamics and slow force
+    if not h.alone:  # with one channel no free form can be told from the base's own dynamics and slow force
         first = slow_forces(data, h.residual, _from_the_start(h), lags=lags)
         forms, mirror = _free_forms(h, search, first)
         late = {kind: slow_onset(data, h.residual, first, kind) for kind in ("gust", "road")}
@@ -183,7 +182,7 @@ def examine(h: Hypothesis, search: Search) -> Examined:
             size = relative_size(data, h.covariance, h.predicted - rest.predicted, rest.effect_energy)
         beside[base_name(e)] = (min(size, 99.0), h.evidence - rest.evidence)
     outliers = sensor_outliers(h) if data.accel is not None else None
-    return Examined(h, exact, tuple(c for c in compositions if c is not None), outliers, beside, mirror)
+    return Examined(h, tuple(c for c in compositions if c is not None), outliers, beside, mirror)
 
 
 def _free_forms(h: Hypothesis, search: Search, slow: SlowForces) -> tuple[dict[str, FreeFormFit], float]:
@@ -213,14 +212,13 @@ def free_form_response(x: Examined, search: Search, form: str) -> FloatArray | N
 def average(
     examined: list[Examined],
     *,
-    alone: bool = False,
     effects: Collection[str] | None = None,
     most: int | None = None,
     prior: Mapping[str, float] | None = None,
 ) -> ModelAverage:
     """The model average over examined hypotheses. `effects`: names that a label may hold; `most` of them; `prior`:
     weights of causes by name, 1 where not given; of `"pair"` for several at once."""
-    weights = [w for x in examined for w in _weights(x, examined, alone)]
+    weights = [w for x in examined for w in _weights(x, examined)]
     if effects is not None or most is not None:
         allowed = None if effects is None else {*effects, "none", "unknown"}
         # what chance decides and nobody asked for is noise
@@ -232,7 +230,7 @@ def average(
             if (allowed is None or set(w.label.split("+")) <= allowed)
             and (most is None or len(w.label.split("+")) <= most)
         ]
-    total: dict[str, list[float]] = {"none": [], "unknown": []}
+    total: dict[str, list[float]] = {}
     best: dict[str, Weight] = {}
     bases: dict[str, list[float]] = {}
     forms: dict[str, list[float]] = {}
@@ -246,15 +244,11 @@ def average(
         families.setdefault(w.families, []).append(total[w.label][-1])
         if w.label not in best or best[w.label].log_weight < w.log_weight:
             best[w.label] = w
-    logs = {label: log_sum(x) if x else -np.inf for label, x in total.items()}
-    top = max(logs.values())
-    chances = {label: math.exp(x - top) for label, x in logs.items()}
-    whole = sum(chances.values())
-    listed = {k: v / whole for k, v in chances.items() if v / whole > _LEAST_LISTED or k in ("none", "unknown")}
-    listed = {k: max(v, _LEAST_LISTED) for k, v in listed.items()}
+    # none and unknown are always listed, be it as the least
+    shares = {"none": 0.0, "unknown": 0.0} | _shares(total)
+    listed = {k: max(v, _LEAST_LISTED) for k, v in shares.items() if v > _LEAST_LISTED or k in ("none", "unknown")}
     whole = sum(listed.values())
-    ordered = sorted(listed.items(), key=lambda kv: -kv[1])
-    chances = {k: v / whole for k, v in ordered}
+    chances = {k: v / whole for k, v in sorted(listed.items(), key=lambda kv: -kv[1])}
     together = _shares(families)
     each = {name: sum(p for own, p in together.items() if name in own) for own in together for name in own}
     return ModelAverage(chances, best, tuple(examined), _shares(bases), _shares(forms), each)
@@ -338,12 +332,12 @@ def _set_in(c: Composition, late: Mapping[str, SlowOnset]) -> Composition:
     return replace(c, total=total, slow=slow, gust_onset=gust.time, road_onset=road.time)
 
 
-def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Weight]:
+def _weights(x: Examined, examined: list[Examined]) -> Iterator[Weight]:
     h = x.hypothesis
     named = [e for e in h.effects if not e.startswith("~") and EFFECTS[e].size(h.values, h.neutral) > 1]
     names = sorted({base_name(e) for e in named})
     count = sum(not e.startswith("~") for e in h.effects)
-    each = EFFECT_NATS_ALONE if alone else EFFECT_NATS
+    each = EFFECT_NATS_ALONE if h.alone else EFFECT_NATS
     odds = -each * count - (UNKNOWN_NATS if h.force is not None else 0.0)
     # outliers that other sets explain are none: more effects may not make more of them
     spikes = [
@@ -368,7 +362,7 @@ def _weights(x: Examined, examined: list[Examined], alone: bool) -> Iterator[Wei
                 # or one cause without a name does it all, and the names are but terms of its description
                 labels.append((None, -UNKNOWN_NATS + (each - TRIED_NATS) * count))
         total, kinds = dict(c.total), SLOW
-        if alone:  # some slow force is any drive's
+        if h.alone:  # some slow force is any drive's
             large = c.slow.gust_sd > _LARGE_OF_COMMAND * h["K_L"] * float(np.std(h.data.command))
             kinds = ("gust",) if large and total["gust"] > total["none"] + SLOW_FORCE_NATS else ("none",)
             total["none"] = max(total["none"], total["gust"] - SLOW_FORCE_NATS)

@@ -141,14 +141,21 @@ def base_name(effect: str) -> str:
     return effect.split("@")[0]
 
 
-def _sized(name: str, effect: str, parameter: str, link: Link, low: float, high: float, sign: int = 1) -> Coordinate:
-    """A coordinate whose prior follows from the effect's typical range."""
-    of = next(p for p in (*TABLE[effect].parameters, *TABLE[effect].derived) if p.name == parameter)
+def _from_range(
+    name: str, of: Parameter, link: Link, low: float, high: float, sign: int = 1, neutral: float = 0.0
+) -> Coordinate:
+    """A coordinate whose prior follows from the typical range of its parameter."""
     to = _LINKS[link][0]
-    ends = sorted(abs(to(sign * x)) for x in (of.low, of.high))
-    signed = link in ("log", "less one") or of.low < 0 < of.high
-    near = ends[-1] / 3 if signed else ends[0]
-    return Coordinate(name, parameter, link, low, high, SCALE_OF_RANGE * ends[-1], FAINT_OF_RANGE * near, sign=sign)
+    away = sorted(abs(to(sign * x) - neutral) for x in (of.low, of.high))
+    signed = link in ("log", "less one") or of.low < neutral < of.high
+    size = SCALE_OF_RANGE * away[1], FAINT_OF_RANGE * (away[1] / 3 if signed else away[0])
+    return Coordinate(name, of.name, link, low, high, *size, sign=sign, neutral=neutral)
+
+
+def _sized(name: str, effect: str, parameter: str, link: Link, low: float, high: float, sign: int = 1) -> Coordinate:
+    """The same of an effect of the table."""
+    of = next(p for p in (*TABLE[effect].parameters, *TABLE[effect].derived) if p.name == parameter)
+    return _from_range(name, of, link, low, high, sign)
 
 
 def _nuisance(
@@ -298,16 +305,8 @@ def _own(kind: type[Effect], p: Parameter) -> Coordinate:
         mean = float(p.typical())
         return Coordinate(name, p.name, "value", low, high, (p.high - p.low) / 2.56, mean=mean, neutral=mean)
     if math.isinf(p.neutral):
-        sign = 1 if p.neutral > 0 else -1
-        near, far = sorted(1 / abs(x) for x in (p.low, p.high))
         most = 1 / max(min(abs(low), abs(high)), 1e-9)
-        return Coordinate(name, p.name, "inverse", 0, most, SCALE_OF_RANGE * far, FAINT_OF_RANGE * near, sign=sign)
+        return _from_range(name, p, "inverse", 0, most, 1 if p.neutral > 0 else -1)
     if p.constraint == "positive" and p.neutral == 1:
-        far = max(abs(math.log(p.low)), abs(math.log(p.high)))
-        ends = math.log(low), math.log(high)
-        return Coordinate(name, p.name, "log", *ends, SCALE_OF_RANGE * far, FAINT_OF_RANGE * far / 3)
-    low, high = min(low, p.neutral), max(high, p.neutral)
-    away = sorted(abs(x - p.neutral) for x in (p.low, p.high))
-    near = away[1] / 3 if p.low < p.neutral < p.high else away[0]
-    size = SCALE_OF_RANGE * away[1], FAINT_OF_RANGE * near
-    return Coordinate(name, p.name, "value", low, high, *size, neutral=p.neutral)
+        return _from_range(name, p, "log", math.log(low), math.log(high))
+    return _from_range(name, p, "value", min(low, p.neutral), max(high, p.neutral), neutral=p.neutral)

@@ -32,10 +32,9 @@ from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.evidence import log_prior
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import _LEAST
+from avtorch.gap.engine.likelihood import LEAST
 from avtorch.gap.engine.priors import TEMPER
-from avtorch.gap.engine.torch_plant import SimulatorPlant, TorchPlant, torch_plant
-from avtorch.gap.engine.torch_recorder import TorchRecorder
+from avtorch.gap.engine.torch_plant import SimulatorPlant, TorchPlant, recorded, torch_plant
 
 _BLOCK = 2**18  # columns times steps of the grid at once: few enough for the processor's cache
 _EDGE = 1e-3  # a start at a limit is moved inside by this share of the knee
@@ -47,7 +46,7 @@ class HypothesisDensity:
     """Log density of the free coordinates of a `hypothesis`: an `avtorch.inference.Density` of a single window.
 
     `chosen`: only these, the others are held; default all. `knee` (coordinate,): of the map between coordinates and z,
-    best a posterior standard deviation. Raises `InputError` where `not_in_torch` has a reason.
+    best a posterior standard deviation. Where `not_in_torch` has a reason there is none.
     """
 
     hypothesis: Hypothesis
@@ -56,9 +55,6 @@ class HypothesisDensity:
     knee: FloatArray | None = None
 
     windows = 1
-
-    def __post_init__(self) -> None:
-        self._plant  # noqa: B018 - raises
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -75,7 +71,7 @@ class HypothesisDensity:
         h = self.hypothesis
         values = {n: torch.tensor(h[n], dtype=x.dtype).expand(x.shape[:-1]) for n in h.free}
         values |= dict(zip(self.names, x.unbind(-1), strict=True))
-        return self._measured - self._recorder.response(*self._plant.on_grid(values), values)
+        return torch.as_tensor(h.data.measured) - recorded(h.data, *self._plant.on_grid(values), values)
 
     def compiled(self, x: FloatArray) -> FloatArray:
         """`log_density` of `x` (column, coordinate) by the compiled plant: (column,), without derivatives, quicker."""
@@ -168,14 +164,6 @@ class HypothesisDensity:
     def _plant(self) -> TorchPlant | SimulatorPlant:
         return torch_plant(self.hypothesis)
 
-    @cached_property
-    def _recorder(self) -> TorchRecorder:
-        return TorchRecorder.of(self.hypothesis.data)
-
-    @cached_property
-    def _measured(self) -> Tensor:
-        return torch.as_tensor(self.hypothesis.data.measured)
-
     def _blocks(self, z: Tensor) -> Iterator[Tensor]:
         size = max(1, _BLOCK // len(self.hypothesis.data.grid.time))
         yield from z.detach().reshape(-1, z.shape[-1]).split(size)
@@ -203,9 +191,9 @@ def of_products(data: DriveData, products: Tensor) -> Tensor:
     size = torch.as_tensor(data.band_size, dtype=products.dtype)
     S = products / size
     if data.channel_count == 1:
-        det = (1 + _LEAST) * S[..., 0, :]
+        det = (1 + LEAST) * S[..., 0, :]
     else:
-        more = _LEAST * (S[..., 0, :] + S[..., 2, :])
+        more = LEAST * (S[..., 0, :] + S[..., 2, :])
         det = (S[..., 0, :] + more) * (S[..., 2, :] + more) - S[..., 1, :] ** 2
     return -0.5 * (size * det.log()).sum(-1)
 

@@ -9,8 +9,9 @@ Channels are the acceleration [m/s²] and the differenced speed [m/s²]; both ke
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -26,6 +27,8 @@ from avtorch.gap.engine.priors import BAND_RATIO, CLAIM_HZ, FRAME_S, WARM_S
 from avtorch.io import Log
 from avtorch.io.log import AccelKind
 
+UNKNOWN_SPEED_MPS = 15.0
+"""What effects read where no speed was measured [m/s]."""
 _MOST_HZ = 100.0  # rows of faster logs are averaged: nothing above half of it is a car's
 _SMOOTH_S = 0.3  # the speed enters effects smoothed over it
 _START_S = 0.6  # over which the first acceleration is averaged
@@ -68,7 +71,6 @@ class DriveData:
     `hold`: rows for which the recorder holds a speed, from the count `hold_phase` on. `align_s` [s]: delay of the
     accelerometer in the coefficients, by which both channels are in phase. `raw_accel`: as read, where outliers
     were replaced. `reference_speed` [m/s]: at which slopes with speed are neutral.
-    `cache`: tables derived from the shape alone.
     """
 
     time: FloatArray
@@ -89,8 +91,7 @@ class DriveData:
     hold_phase: int = 0
     align_s: float = 0.0
     raw_accel: FloatArray | None = None
-    reference_speed: float = 15.0
-    cache: dict[str, Any] = field(default_factory=dict)
+    reference_speed: float = 0.0
     # of the transform, see `_frame`
     warm_rows: int = 0
     frame_rows: int = 0
@@ -118,8 +119,8 @@ class DriveData:
         same_kind(each)
         rate = min(log.rate_hz for log in each)
         group = max(1, int(1.02 * rate / _MOST_HZ))
-        columns: dict[str, list[FloatArray]] = {
-            name: [] for name in ("time", "stamp", "log", "source", "count", "u", "a", "v")
+        columns: dict[str, list[Any]] = {
+            name: [] for name in ("time", "stamp", "log", "source", "count", "command", "accel", "speed")
         }
         lengths, begin, longest = [0], 0.0, 0.0
         for number, log in enumerate(each):
@@ -142,9 +143,9 @@ class DriveData:
                 columns["log"].append(np.full(rows, number))
                 columns["source"].append(np.arange(cut.start, cut.stop, group))
                 columns["count"].append(count[cut.start : cut.stop : group] // group)
-                columns["u"].append(mean(log.accel_cmd))
-                columns["a"].append(mean(log.accel))
-                columns["v"].append(mean(log.speed))
+                columns["command"].append(mean(log.accel_cmd))
+                columns["accel"].append(mean(log.accel))
+                columns["speed"].append(mean(log.speed))
                 lengths.append(rows)
             begin += float(log.elapsed[-1]) + 60.0  # no delay reaches from one log into another
         if len(lengths) == 1:
@@ -153,21 +154,13 @@ class DriveData:
                 f"{names}: {longest:.1f} s of driving in one stretch (moving, engaged), needs "
                 f"{WARM_S + 2 * FRAME_S[0]:.0f} s or more"
             )
-        whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+        whole: dict[str, Any] = {name: np.concatenate(parts) for name, parts in columns.items()}
+        whole |= {name: None for name in ("accel", "speed") if getattr(each[0], name) is None}
         bounds = np.cumsum(lengths)
         dt = float(np.median(np.diff(whole["time"])))
-        accel = whole["a"] if each[0].accel is not None else None
-        speed = whole["v"] if each[0].speed is not None else None
         data = cls(
-            time=whole["time"],
-            stamp=whole["stamp"],
-            log=whole["log"].astype(np.int64),
-            source=whole["source"].astype(np.int64),
-            count=whole["count"].astype(np.int64),
-            command=whole["u"],
-            accel=accel,
-            speed=speed,
-            smooth_speed=_smooth_speed(whole["time"], accel, speed, bounds, dt),
+            **whole,
+            smooth_speed=_smooth_speed(whole["time"], whole["accel"], whole["speed"], bounds, dt),
             position=np.zeros(len(whole["time"])),
             bounds=bounds,
             dt=dt,
@@ -220,18 +213,27 @@ class DriveData:
         out[self.bounds[:-1]] = True
         return out
 
-    @property
+    @cached_property
     def window(self) -> FloatArray:
-        if "window" not in self.cache:
-            M = self.frame_rows
-            self.cache["window"] = np.sin(np.pi * (np.arange(2 * M) + 0.5) / (2 * M))
-        return self.cache["window"]
+        M = self.frame_rows
+        return np.sin(np.pi * (np.arange(2 * M) + 0.5) / (2 * M))
 
-    @property
+    @cached_property
     def grid(self) -> Grid:
-        if "grid" not in self.cache:
-            self.cache["grid"] = self._grid()
-        return self.cache["grid"]
+        steps = np.diff(self.time)
+        last = np.zeros(len(self.time), bool)
+        last[self.bounds[1:] - 1] = True
+        parts = np.where(last, 1, (np.append(steps, 1.0) / GRID_S).astype(np.int64) + 1)
+        row = np.repeat(np.arange(len(self.time)), parts)
+        within = np.arange(len(row)) - np.repeat(np.cumsum(parts) - parts, parts)
+        share = within / parts[row]
+        later = np.minimum(row + 1, len(self.time) - 1)
+        time = self.time[row] + share * (self.time[later] - self.time[row])
+        speed = self.smooth_speed[row] + share * (self.smooth_speed[later] - self.smooth_speed[row])
+        starts = self.starts[row] & (within == 0)
+        accel0 = np.zeros(len(row))
+        accel0[starts] = [self._first_accel(i) for i in self.bounds[:-1]]
+        return Grid(time, row, speed, starts, accel0)
 
     # rows to coefficients and back -----------------------------------------------------------------------------------
     def transform(self, rows: Sequence[FloatArray]) -> FloatArray:
@@ -262,18 +264,14 @@ class DriveData:
         edges = self.band_edges[: max(int(np.searchsorted(self.frequency[self.band_edges[:-1]], fmax)), 1) + 1]
         bins = int(edges[-1])
         measured = np.ascontiguousarray(self.measured[:, :, :bins])
-        return replace(
-            self, band_edges=edges, frequency=self.frequency[:bins], measured=measured, cache=self._tables_of_rows()
-        )
+        return replace(self, band_edges=edges, frequency=self.frequency[:bins], measured=measured)
 
     def only(self, frames: BoolArray) -> DriveData:
         """The same drives, of which only these `frames` (frame,) count."""
         used = self.used.copy()
         used[self.used] = frames
         measured = self.measured[:, frames]
-        return replace(
-            self, used=used, frame_time=self.frame_time[frames], measured=measured, cache=self._tables_of_rows()
-        )
+        return replace(self, used=used, frame_time=self.frame_time[frames], measured=measured)
 
     def part(self, rows: BoolArray) -> DriveData:
         """The stretches at `rows` (row,), which are successive; slopes stay neutral at the speed of all drives."""
@@ -289,7 +287,6 @@ class DriveData:
             used=self.used[frame_rows],
             frame_time=self.frame_time[frame_rows[self.used]],
             measured=self.measured[:, frame_rows[self.used]],
-            cache={},
         )
 
     def with_accel(self, accel: FloatArray) -> DriveData:
@@ -312,28 +309,37 @@ class DriveData:
 
     def aligned(self, accel: FloatArray) -> FloatArray:
         """As late as the speed: what shakes the car is then in phase in both."""
-        if not self.align_s:
-            return accel
-        rows = np.arange(len(self.time))
-        return self._between(
-            f"aligned by {self.align_s}", lambda: np.interp(self.time - self.align_s, self.time, rows), accel
-        )
+        return _read(np.ascontiguousarray(accel), *self.aligned_at) if self.align_s else accel
+
+    @cached_property
+    def aligned_at(self) -> tuple[IntArray, FloatArray]:
+        """Where `aligned` reads: rows (row,), and shares of the way to the next."""
+        return _places(np.interp(self.time - self.align_s, self.time, np.arange(len(self.time))))
 
     def speed_difference(self, speed: FloatArray) -> FloatArray:
-        """Central difference [m/s²], in phase with the acceleration."""
-        out = np.empty_like(speed)
-        if "rate" not in self.cache:
-            self.cache["rate"] = 1.0 / np.maximum(self.time[2:] - self.time[:-2], 0.3 * self.dt)
-        out[1:-1] = (speed[2:] - speed[:-2]) * self.cache["rate"]
-        ends, begins = self.bounds[1:] - 1, self.bounds[:-1]
-        out[ends], out[begins] = out[ends - 1], out[begins + 1]
-        return out
+        """Central difference [m/s²], in phase with the acceleration; at the ends of stretches that of the next row."""
+        rate, middle = self.difference_tables
+        return ((speed[2:] - speed[:-2]) * rate)[middle]
+
+    @cached_property
+    def difference_tables(self) -> tuple[FloatArray, IntArray]:
+        """Of two rows' difference: its factor (row - 2,) [1/s], and which of them each row (row,) shows."""
+        middle = np.arange(len(self.time))
+        middle[self.bounds[1:] - 1] -= 1
+        middle[self.bounds[:-1]] += 1
+        return 1.0 / np.maximum(self.time[2:] - self.time[:-2], 0.3 * self.dt), middle - 1
 
     def held(self, x: FloatArray) -> FloatArray:
         """As a recorder shows it that refreshes every `hold` rows, whether or not that row was lost."""
-        if self.hold == 1:
-            return x
-        return self._between(f"held for {self.hold} from {self.hold_phase}", self._refreshed, x)
+        return x if self.hold == 1 else _read(np.ascontiguousarray(x), *self.held_at)
+
+    @cached_property
+    def held_at(self) -> tuple[IntArray, FloatArray]:
+        """Where `held` reads: the row (row,) of the last refresh, between two rows where that one was lost."""
+        count = self.count + self.log * (2 * self.count.max() + self.hold)
+        since = (self.count - self.hold_phase) % self.hold
+        first = np.repeat(self.bounds[:-1], np.diff(self.bounds))
+        return _places(np.maximum(np.interp(count - since, count, np.arange(len(count))), first))
 
     def low_pass(self, x: FloatArray, time_constant: float) -> FloatArray:
         """One pole of this time constant [s], at rest at the start of each stretch (see `one_pole`)."""
@@ -342,37 +348,16 @@ class DriveData:
         gaps, steps = self.gaps
         return filtered(np.ascontiguousarray(x), self.bounds, gaps, *one_pole(time_constant, steps))
 
-    @property
+    @cached_property
     def gaps(self) -> tuple[IntArray, FloatArray]:
         """Rows (row,) that were lost in front of each, and the steps [s] for none, one, and so on."""
-        if "gaps" not in self.cache:
-            lost = np.maximum(np.diff(self.count, prepend=self.count[:1]), 1) - 1
-            lost[self.bounds[:-1]] = 0
-            self.cache["gaps"] = lost, self.dt * np.arange(1.0, lost.max() + 2)
-        return self.cache["gaps"]
+        lost = np.maximum(np.diff(self.count, prepend=self.count[:1]), 1) - 1
+        lost[self.bounds[:-1]] = 0
+        return lost, self.dt * np.arange(1.0, lost.max() + 2)
 
     # inside ----------------------------------------------------------------------------------------------------------
     def _measured(self) -> FloatArray:
         return self.transform(self.channel_rows(self.accel, self.speed))
-
-    def _refreshed(self) -> FloatArray:
-        """Row (row,) of the last refresh, between two rows where that one was lost."""
-        count = self.count + self.log * (2 * self.count.max() + self.hold)
-        since = (self.count - self.hold_phase) % self.hold
-        first = np.repeat(self.bounds[:-1], np.diff(self.bounds))
-        return np.maximum(np.interp(count - since, count, np.arange(len(count))), first)
-
-    def _between(self, name: str, places: Callable[[], FloatArray], x: FloatArray) -> FloatArray:
-        """`x` (row,) read linearly at `places` (row,) between rows, which are computed once under a `name`."""
-        if name not in self.cache:
-            at = places()
-            below = np.clip(at.astype(np.int64), 0, len(at) - 2)
-            self.cache[name] = below, at - below
-        return _read(np.ascontiguousarray(x), *self.cache[name])
-
-    def _tables_of_rows(self) -> dict[str, Any]:
-        """The cached tables that do not depend on frames and bins."""
-        return {k: v for k, v in self.cache.items() if k in ("grid", "window", "rate")}
 
     def _frame(self) -> None:
         """Cut stretches into frames and bins into bands."""
@@ -422,22 +407,6 @@ class DriveData:
                 return k, int(counts.argmax())
         return 1, 0
 
-    def _grid(self) -> Grid:
-        steps = np.diff(self.time)
-        last = np.zeros(len(self.time), bool)
-        last[self.bounds[1:] - 1] = True
-        parts = np.where(last, 1, (np.append(steps, 1.0) / GRID_S).astype(np.int64) + 1)
-        row = np.repeat(np.arange(len(self.time)), parts)
-        within = np.arange(len(row)) - np.repeat(np.cumsum(parts) - parts, parts)
-        share = within / parts[row]
-        later = np.minimum(row + 1, len(self.time) - 1)
-        time = self.time[row] + share * (self.time[later] - self.time[row])
-        speed = self.smooth_speed[row] + share * (self.smooth_speed[later] - self.smooth_speed[row])
-        starts = self.starts[row] & (within == 0)
-        accel0 = np.zeros(len(row))
-        accel0[starts] = [self._first_accel(i) for i in self.bounds[:-1]]
-        return Grid(time, row, speed, starts, accel0)
-
     def _first_accel(self, row: int) -> float:
         w = max(3, int(_START_S / self.dt))
         if self.accel is not None:
@@ -462,10 +431,9 @@ def _stretches(log: Log) -> list[slice]:
 def _smooth_speed(
     time: FloatArray, accel: FloatArray | None, speed: FloatArray | None, bounds: IntArray, dt: float
 ) -> FloatArray:
-    """The speed beside the integral of the acceleration, smoothed: corners stay sharp. 15 m/s where none was
-    measured."""
+    """The speed beside the integral of the acceleration, smoothed: corners stay sharp."""
     if speed is None:
-        return np.full(len(time), 15.0)
+        return np.full(len(time), UNKNOWN_SPEED_MPS)
     out = np.empty_like(speed)
     for i, j in itertools.pairwise(bounds):
         c = np.zeros(j - i)
@@ -473,6 +441,12 @@ def _smooth_speed(
             c[1:] = np.cumsum(0.5 * (accel[i + 1 : j] + accel[i : j - 1]) * np.diff(time[i:j]))
         out[i:j] = gaussian_filter1d(speed[i:j] - c, _SMOOTH_S / dt) + c
     return out
+
+
+def _places(at: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Rows at or before places between rows, (row,), and shares of the way to the next."""
+    below = np.clip(at.astype(np.int64), 0, len(at) - 2)
+    return below, at - below
 
 
 def _dct4(x: FloatArray) -> FloatArray:

@@ -20,11 +20,10 @@ from torch import Tensor
 from avtorch.gap.engine.coordinates import COORDINATES, EFFECTS, INDEX
 from avtorch.gap.engine.gauss_newton import linearised, normal_prior, whitened_under_noise
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import claimed, freedom, log_sum
+from avtorch.gap.engine.likelihood import HALF_LOG_2PI, claimed, freedom, log_sum
 from avtorch.gap.engine.priors import LOST_NATS, ONSET_ODDS, SHIFT_NATS, TRIED_NATS
 from avtorch.gap.engine.shape_error import effect_energy, shape_likelihood, shape_log_prior
 
-_HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 _STUDENT_3 = math.log(2 / (math.pi * math.sqrt(3)))  # log density at the centre, scale 1
 _IMPOSSIBLE = -60.0  # nats: an effect of no size; finite, so that sets compare
 _ROUNDS = 4  # until the noise beside a force map has settled within a tenth of a nat
@@ -42,7 +41,7 @@ def log_prior(h: Hypothesis, names: Sequence[str], x: Tensor) -> Tensor:
         mean, scale = normal_prior(name, h.neutral[INDEX[name]])
         if name == "T_L":
             z = (at.log() - mean) / _BASE_SD[name]
-            total = total - 0.5 * z * z - at.log() - math.log(_BASE_SD[name]) - _HALF_LOG_2PI
+            total = total - 0.5 * z * z - at.log() - math.log(_BASE_SD[name]) - HALF_LOG_2PI
         elif name == "K_L":
             total = total + _student((at - mean) / _BASE_SD[name]) - math.log(_BASE_SD[name])
         elif name in COORDINATES and COORDINATES[name].mean is None:
@@ -50,7 +49,7 @@ def log_prior(h: Hypothesis, names: Sequence[str], x: Tensor) -> Tensor:
             sides = 0.0 if c.signed else math.log(2)
             total = total + _student((at - mean) / c.scale) - math.log(c.scale) + sides
         else:
-            total = total - 0.5 * ((at - mean) / scale) ** 2 - math.log(scale) - _HALF_LOG_2PI
+            total = total - 0.5 * ((at - mean) / scale) ** 2 - math.log(scale) - HALF_LOG_2PI
     for effect in h.effects:
         sized = [(own[c.name] - h.neutral[INDEX[c.name]]) / c.faint for c in EFFECTS[effect].coordinates if c.faint]
         if sized:
@@ -69,7 +68,6 @@ def evaluate_evidence(h: Hypothesis) -> Hypothesis:
     h.jacobian, precision, _ = linearised(h, names)
     W = whitened_under_noise(h, h.jacobian, precision, _ROUNDS)
     h.information = W @ W.T + np.diag(precision)
-    h.claimed = claimed(h.data, h.covariance)
     first = base.plain or base
     first_claimed = claimed(first.data, first.covariance)
     h.effect_energy, h.shape, h.shape_log = None, None, np.zeros(1)
@@ -78,8 +76,8 @@ def evaluate_evidence(h: Hypothesis) -> Hypothesis:
         h.shape = shape_likelihood(h.data, h.residual, h.effect_energy)
     if h.shape is not None:
         h.shape_log = h.shape.nats + shape_log_prior(h.effects)
-    gain = min(h.claimed - first_claimed, h.log_likelihood - first.log_likelihood)
-    volume = len(names) * _HALF_LOG_2PI - 0.5 * float(np.linalg.slogdet(h.information)[1])
+    gain = min(claimed(h.data, h.covariance) - first_claimed, h.log_likelihood - first.log_likelihood)
+    volume = len(names) * HALF_LOG_2PI - 0.5 * float(np.linalg.slogdet(h.information)[1])
     prior = float(log_prior(h, names, torch.as_tensor(h.values[[INDEX[n] for n in names]])))
     h.evidence = gain + log_sum(h.shape_log) + prior + volume + _onset_odds(h) + _force_density(h)
     h.evidence -= LOST_NATS * len(h.lost) + SHIFT_NATS * len(h.shift_speeds) * ("gear_shift" in h.effects)

@@ -32,7 +32,7 @@ from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.force_map import MAP_SIZES, MapForm, map_forms, size_log_prior
 from avtorch.gap.engine.gauss_newton import linear_priors
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import claimed, freedom, log_likelihood, log_sum, whiten
+from avtorch.gap.engine.likelihood import claimed, freedom, least_noise, log_likelihood, log_sum, whiten
 
 COEFFICIENT_SD = 0.35
 """Prior sd of a form's coefficient [of the demand; a tone's: m/s^2]: a third of what the command asks for."""
@@ -50,8 +50,9 @@ TONE_HZ = 3.0
 """Tones are searched for below [Hz]: swinging loops and controllers, not the engine or the wheels."""
 TONE_BACKGROUND_HZ = 0.25
 """Width [Hz] of the running median that is the noise around a line, at least 15 bins of the spectrum."""
-_LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
 _DELAY_STEP_S = 0.02  # of the finite difference in a delay: about the typical wandering
+_ROUNDS = 4  # of coefficients given the noise, noise given coefficients; the best is the answer
+_COURSES = 3  # of what wanders, each under the noise that the last one left
 _OF_LAGS = ("linear", "sided")  # forms in whose fit the car's own lag moves far
 
 
@@ -120,11 +121,10 @@ def mirror_columns(h: Hypothesis) -> FreeForm:
     return FreeForm("mirror", demand_response(h, demands, lags, backwards=True))
 
 
-def block(h: Hypothesis, form: FreeForm, iterations: int = 4) -> FreeFormFit:
+def block(h: Hypothesis, form: FreeForm) -> FreeFormFit:
     """Evidence of a linear form beside `h`, whose parameters may move again, summed over the form's sizes.
 
-    `h`: with its evidence evaluated (`jacobian`, `information`). `iterations`: alternations between coefficients and
-    noise; the best is the answer.
+    `h`: with its evidence evaluated (`jacobian`, `information`).
     """
     precision, pull = linear_priors(h, h.free)
     known = len(h.jacobian)
@@ -135,7 +135,7 @@ def block(h: Hypothesis, form: FreeForm, iterations: int = 4) -> FreeFormFit:
     pull = np.concatenate([pull, np.zeros(count)])
     nats: list[float] = []
     many = len(form.sizes) > 1
-    rounds = 2 * iterations if many else iterations
+    rounds = 2 * _ROUNDS if many else _ROUNDS
     best, size = np.zeros(known + count), form.sizes[0][0]
     for sd, log_prior in form.sizes:
         tight = np.concatenate([precision, np.full(count, sd**-2)])
@@ -288,7 +288,7 @@ def linear_evidence(
         if integrated:
             unsure = cho_solve(factor, np.eye(len(precision)))
             spread = np.einsum("bcdkl,kl->bcd", products[..., 1:, 1:], unsure) / data.band_size[:, None, None]
-        noise += spread + _LEAST * np.trace(noise, axis1=1, axis2=2)[:, None, None] * np.eye(data.channel_count)
+        noise += spread + least_noise(noise)
         gain = min(claimed(data, noise) - before[0], claimed(data, noise, math.inf) - before[1])
         gain += 0.5 * freedom(data, noise, spread) if integrated else 0.0
         gain += float(pull @ moves - 0.5 * precision @ moves**2) - float(np.log(np.diag(factor[0])).sum())
@@ -332,7 +332,7 @@ def _wandering_responses(h: Hypothesis) -> dict[str, FloatArray]:
     return {"gain": h.predicted, "delay": change / (2.0 * _DELAY_STEP_S)}
 
 
-def _wandering(h: Hypothesis, response: FloatArray, sd: float, iterations: int = 3) -> FreeFormFit:
+def _wandering(h: Hypothesis, response: FloatArray, sd: float) -> FreeFormFit:
     """Evidence of a course times `response` (channel, frame, bin) beside `h`, whose parameters may move again.
 
     What wanders is noise at first; once it is out, the noise is smaller: both are found in turn. The noise is larger in
@@ -361,7 +361,7 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float, iterations: int =
     promised = max(gain(alone, h.residual - np.einsum("p,pcfk->cfk", alone, h.jacobian))[0], 0.0)
     noise, left = h.covariance, h.residual
     best, moved = FreeFormFit(-math.inf, None, np.zeros(frames)), alone
-    for _ in range(iterations):
+    for _ in range(_COURSES):
         w, r, remaining = (by_frame(x, noise) for x in (response, h.residual, left))
         energy = (w * w).sum(1)
         scale = np.sqrt(np.maximum((w * w * remaining**2).sum(1) / np.maximum(energy, 1e-12), 1.0))[:, None]

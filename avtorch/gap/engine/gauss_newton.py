@@ -162,14 +162,14 @@ def whitened_jacobian(h: Hypothesis, derivatives: FloatArray) -> FloatArray:
     return np.array([whiten(h.data, h.covariance, j) for j in derivatives])
 
 
-def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05, names: Sequence[str] | None = None) -> Hypothesis:
+def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05) -> Hypothesis:
     """The hypothesis at the maximum of `objective`, changed in place and returned.
 
     Steps are shortened by damping until they gain; a coordinate that would leave its limits stays there and the others
     are solved again. A likelihood in a delay has creases, where commands arrive with a row: on one, no step gains, and
     delays are held. Stops where a step gains less than `tolerance` [nats].
     """
-    names = h.free if names is None else list(names)
+    names = h.free
     at = [INDEX[n] for n in names]
     low, high = np.array([h.limits(n) for n in names]).T
     boundless = np.full(len(h.force_coefficients), np.inf)

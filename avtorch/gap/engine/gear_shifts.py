@@ -68,19 +68,16 @@ def shift_speeds(h: Hypothesis) -> tuple[FloatArray, float]:
 
     `h` has been evaluated, without gear shifts. Each speed has paid `SHIFT_NATS`.
     """
-    data = h.data
     best: tuple[FloatArray, float] = (np.zeros(0), 0.0)
-    levels = _levels(data)
-    if data.speed is None or not len(levels):
+    levels = _levels(h.data)
+    if h.data.speed is None or not len(levels):
         return best
-    likelihood = _PulseLikelihood.of(h, h.residual)
-    upshifts = [likelihood.upshifts(g, h["shift_hysteresis"]) for g in levels]
+    likelihood = _PulseLikelihood.of(h)
     for duration in DURATIONS_S:
-        pulses = [likelihood.pulses(times, duration) for times in upshifts]
-        sizes = [likelihood.size(p) for p in pulses]
-        found, nats = _pursued(likelihood, levels, pulses, sizes)
+        shifts = _Shifts(likelihood, h["shift_hysteresis"], duration, {})
+        nats = shifts.add_all(levels)
         if nats > best[1]:
-            best = (found, nats)
+            best = (np.array(sorted(shifts.levels)), nats)
     return best
 
 
@@ -99,11 +96,15 @@ def refined_shift_speeds(h: Hypothesis) -> Hypothesis:
 
 def _moved(h: Hypothesis) -> Hypothesis | None:
     """The hypothesis with levels moved, dropped and added; None where that changes nothing or leaves none."""
-    shifts, new = _Shifts(h), h.copy()
+    depth, duration = h["shift_depth"], h["shift_duration"]
+    levels = dict.fromkeys(h.shift_speeds.tolist(), depth)
+    if depth < _LEAST_DEPTH:  # speeds at which nothing happens: from none
+        levels, duration = {}, EFFECTS["gear_shift"].starts[0][1]
+    shifts, new = _Shifts(_PulseLikelihood.of(h), h["shift_hysteresis"], duration, levels), h.copy()
     if not shifts.ascend() or not shifts.levels:
         return None
     new.shift_speeds = np.array(sorted(shifts.levels))
-    new["shift_depth"], new["shift_duration"] = shifts.depth, shifts.duration
+    new["shift_depth"], new["shift_duration"] = shifts.depth, duration
     return new.evaluate()
 
 
@@ -225,17 +226,14 @@ def _apart(levels: FloatArray, others: FloatArray) -> BoolArray:
 # interruptions as pulses of the demand -------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class _Pulses:
-    """Interruptions of full depth: `first` (upshift,) rows and `values` (upshift, row) [m/s²], 0 behind their end."""
+    """Interruptions p of full depth: `first` (upshift,) rows and `values` (upshift, row) [m/s²], 0 behind their end.
+
+    `size` is p' A~ p of all together, and `others` N^-1 Z p (parameter,) what the other parameters take of them.
+    """
 
     first: IntArray
     values: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Size:
-    """`own` p' A~ p of pulses p, and `others` N^-1 Z p (parameter,): what the other parameters take of them."""
-
-    own: float
+    size: float
     others: FloatArray
 
 
@@ -258,15 +256,15 @@ class _PulseLikelihood:
     since: float
 
     @classmethod
-    def of(cls, h: Hypothesis, residual: FloatArray) -> _PulseLikelihood:
-        """The likelihood around a hypothesis, whose response without gear shifts leaves `residual`."""
+    def of(cls, h: Hypothesis) -> _PulseLikelihood:
+        """The likelihood around an evaluated hypothesis."""
         data = h.data
         names = [n for n in h.free if n not in ("shift_depth", "shift_duration")]
         derivatives = jacobian(h, names)
         precision, pull = prior_terms(h, names)
-        normal, gradient = information_of_coefficients(data, h.covariance, derivatives, residual)
+        normal, gradient = information_of_coefficients(data, h.covariance, derivatives, h.residual)
         inverse = np.asarray(np.linalg.inv(normal + np.diag(precision + 1e-12)), np.float64)
-        *columns, score = demand_score(h, h.covariance, np.array([*derivatives, residual]), dead_time=False)
+        *columns, score = demand_score(h, h.covariance, np.array([*derivatives, h.residual]), dead_time=False)
         columns = np.array(columns)
         score -= (inverse @ (gradient + pull)) @ columns
         lags = round(WARM_S / data.dt)
@@ -283,52 +281,23 @@ class _PulseLikelihood:
 
     def pulses(self, times: FloatArray, duration: float) -> _Pulses:
         """Of upshifts at `times` (upshift,) [s]; the plant's interruption begins a step of its grid later."""
-        begins = times + self._delay
-        first = np.searchsorted(self.data.time, begins, side="right") - 1
-        values = _pulses(self.data.time, self.data.starts, self.demand, begins, first, duration)
-        return _Pulses(first, values)
-
-    @property
-    def _delay(self) -> float:
-        dt = self.data.dt
-        return dt / (int(dt / GRID_S) + 1)
-
-    def size(self, pulses: _Pulses) -> _Size:
-        across = _dots(self.columns, pulses.first, pulses.values)
+        data = self.data
+        begins = times + data.dt / (int(data.dt / GRID_S) + 1)
+        first = np.searchsorted(data.time, begins, side="right") - 1
+        values = _pulses(data.time, data.starts, self.demand, begins, first, duration)
+        across = _dots(self.columns, first, values)
         taken = self.inverse @ across
-        return _Size(_energy(pulses.first, pulses.values, self.information, self.cover) - float(across @ taken), taken)
+        size = _energy(first, values, self.information, self.cover) - float(across @ taken)
+        return _Pulses(first, values, size, taken)
 
     def gain(self, score: FloatArray, pulses: _Pulses) -> float:
         """-score' p [nats per depth]."""
         return -float(_dots(score[None], pulses.first, pulses.values)[0])
 
-    def take_out(self, score: FloatArray, pulses: _Pulses, size: _Size, depth: float) -> None:
+    def take_out(self, score: FloatArray, pulses: _Pulses, depth: float) -> None:
         """`score` beside pulses of that depth (negative: without them), in place."""
         _take_out_all(score, self.information, self.cover, pulses.first, pulses.values, -depth)
-        score -= depth * (size.others @ self.columns)
-
-
-def _pursued(
-    likelihood: _PulseLikelihood, levels: FloatArray, pulses: list[_Pulses], sizes: list[_Size]
-) -> tuple[FloatArray, float]:
-    """Levels chosen one by one, each at its best depth, and what they gain less `SHIFT_NATS` each."""
-    score = likelihood.score.copy()
-    own = np.array([s.own for s in sizes])
-    free = own > 0.5  # less than half a nat at full depth: nothing to be seen
-    chosen: list[float] = []
-    total = 0.0
-    while len(chosen) < _MOST_LEVELS and free.any():
-        slope = np.array([likelihood.gain(score, p) if f else 0.0 for p, f in zip(pulses, free, strict=True)])
-        depth = np.clip(slope / np.maximum(own, 1e-9), 0.0, 1.0)
-        gains = np.where(free, depth * (slope - 0.5 * depth * own), 0.0)
-        k = int(gains.argmax())
-        if gains[k] <= SHIFT_NATS:
-            break
-        total += float(gains[k]) - SHIFT_NATS
-        chosen.append(float(levels[k]))
-        likelihood.take_out(score, pulses[k], sizes[k], float(depth[k]))
-        free &= _apart(levels, levels[k : k + 1])
-    return np.array(sorted(chosen)), total
+        score -= depth * (pulses.others @ self.columns)
 
 
 class _Shifts:
@@ -339,20 +308,17 @@ class _Shifts:
     wrong by at the few upshifts of a level then changes no sign.
     """
 
-    def __init__(self, h: Hypothesis) -> None:
-        self.likelihood = _PulseLikelihood.of(h, h.residual)
-        self.score = self.likelihood.score.copy()
-        self.hysteresis, self.duration = h["shift_hysteresis"], h["shift_duration"]
-        self.levels = dict.fromkeys(h.shift_speeds.tolist(), h["shift_depth"])
-        if h["shift_depth"] < _LEAST_DEPTH:  # speeds at which nothing happens: from none
-            self.levels, self.duration = {}, EFFECTS["gear_shift"].starts[0][1]
-        self._known: dict[float, tuple[_Pulses, _Size]] = {}
+    def __init__(
+        self, likelihood: _PulseLikelihood, hysteresis: float, duration: float, levels: dict[float, float]
+    ) -> None:
+        self.likelihood, self.hysteresis, self.duration, self.levels = likelihood, hysteresis, duration, levels
+        self.score = likelihood.score.copy()
+        self._known: dict[float, _Pulses] = {}
 
     @property
     def depth(self) -> float:
         """The common depth, each level's weighed by its information."""
-        sizes = [self._pulses(g)[1].own for g in self.levels]
-        return float(np.average(list(self.levels.values()), weights=sizes))
+        return float(np.average(list(self.levels.values()), weights=[self._pulses(g).size for g in self.levels]))
 
     def ascend(self) -> bool:
         """Move, drop and add levels while that gains; whether anything did."""
@@ -360,32 +326,37 @@ class _Shifts:
         near = np.arange(-_NEAR_MPS, _NEAR_MPS + 1e-9, _FINE_MPS)
         total = 0.0
         for _ in range(_PASSES):
-            gained = sum(self._move(g, np.round(g + near, 2)) for g in list(self.levels))
-            while len(self.levels) < _MOST_LEVELS and (more := self._add(coarse)) > 0.0:
-                gained += more
+            gained = sum(self._move(g, np.round(g + near, 2)) for g in list(self.levels)) + self.add_all(coarse)
             total += gained
             if gained < _LEAST_NATS:
                 break
         return total >= _LEAST_NATS
 
-    def _pulses(self, level: float) -> tuple[_Pulses, _Size]:
+    def add_all(self, levels: FloatArray) -> float:
+        """Add the best of `levels` one by one, while any is worth its price; what they gain."""
+        total = 0.0
+        while len(self.levels) < _MOST_LEVELS and (more := self._add(levels)) > 0.0:
+            total += more
+        return total
+
+    def _pulses(self, level: float) -> _Pulses:
         if level not in self._known:
-            pulses = self.likelihood.pulses(self.likelihood.upshifts(level, self.hysteresis), self.duration)
-            self._known[level] = pulses, self.likelihood.size(pulses)
+            times = self.likelihood.upshifts(level, self.hysteresis)
+            self._known[level] = self.likelihood.pulses(times, self.duration)
         return self._known[level]
 
     def _gain(self, level: float, depth: float | None = None) -> tuple[float, float]:
         """Nats of one more level, less its price, and its depth (None: the best one)."""
-        pulses, size = self._pulses(level)
+        pulses = self._pulses(level)
         slope = self.likelihood.gain(self.score, pulses)
         if depth is None:
-            depth = min(max(slope / size.own, 0.0), 1.0) if size.own > _LEAST_NATS else 0.0
-        return depth * (slope - 0.5 * depth * size.own) - SHIFT_NATS, depth
+            depth = min(max(slope / pulses.size, 0.0), 1.0) if pulses.size > _LEAST_NATS else 0.0
+        return depth * (slope - 0.5 * depth * pulses.size) - SHIFT_NATS, depth
 
     def _move(self, level: float, by: FloatArray) -> float:
         """Put the best of the levels `by` in place of one, or leave it out where none is worth its price."""
         depth = self.levels.pop(level)
-        self.likelihood.take_out(self.score, *self._pulses(level), -depth)
+        self.likelihood.take_out(self.score, self._pulses(level), -depth)
         before, _ = self._gain(level, depth)
         return self._add(np.append(by[by > LOWEST_MPS], level)) - before
 
@@ -398,7 +369,7 @@ class _Shifts:
             return 0.0
         level = float(levels[gains.index(best)])
         self.levels[level] = best[1]
-        self.likelihood.take_out(self.score, *self._pulses(level), best[1])
+        self.likelihood.take_out(self.score, self._pulses(level), best[1])
         return best[0]
 
 

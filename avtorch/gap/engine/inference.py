@@ -27,13 +27,11 @@ RANDOM = ("gust", "road_grade", "outliers")
 
 @dataclass(frozen=True, eq=False)
 class Inference:
-    """The posterior of a car's drives: `base`, the `search` and its `average`; `alone`: judged by one channel, or below
-    `ONE_CHANNEL_HZ`."""
+    """The posterior of a car's drives: `base`, the `search` and its `average`."""
 
     base: Hypothesis
     search: Search
     average: ModelAverage
-    alone: bool
 
     @property
     def data(self) -> DriveData:
@@ -68,8 +66,7 @@ def infer(
     if cleaned is not None:
         data = cleaned
         base = base_fit(data, baseline)
-    alone = data.channel_count == 1
-    if alone:
+    if data.channel_count == 1:
         data = data.below(ONE_CHANNEL_HZ)
         base = base_fit(data, baseline, alone=True)
     base.base = base
@@ -77,14 +74,12 @@ def infer(
     if gears:
         base.shift_speeds = shift_speeds(base)[0]
         evaluate_evidence(base.evaluate())
-    search = Search(base, effects, alone=alone, stop=stop, progress=progress, most=min(most or 4, 4))
+    search = Search(base, effects, stop=stop, progress=progress, most=min(most or 4, 4))
     search.run()
     told("average", 0, 1)
     named = [e for e in effects if not e.startswith("~")]
-    found = average(
-        examined_sets(search), alone=alone, effects=[*named, *map(base_name, named)], most=most, prior=prior
-    )
-    return Inference(search.base, search, found, alone)
+    found = average(examined_sets(search), effects=[*named, *map(base_name, named)], most=most, prior=prior)
+    return Inference(search.base, search, found)
 
 
 def cleaned_drives(base: Hypothesis, *, gears: bool = False) -> DriveData | None:

@@ -12,6 +12,7 @@ answers the noise, and the cross terms cancel over all frequencies only (predict
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,7 +20,9 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.drive_data import DriveData
 
-_LEAST = 1e-9  # of a covariance's trace: what no channel's rounding goes below
+HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
+LEAST = 1e-9
+"""Of a covariance's trace: what no channel's rounding goes below."""
 
 
 def band_covariance(data: DriveData, residual: FloatArray) -> FloatArray:
@@ -42,9 +45,14 @@ def log_likelihood(data: DriveData, residual: FloatArray, spread: FloatArray | N
     """
     S = band_covariance(data, residual)
     S = S if spread is None else S + spread
-    trace = np.trace(S, axis1=1, axis2=2)
-    S = S + _LEAST * trace[:, None, None] * np.eye(data.channel_count)
+    S = S + least_noise(S)
     return float(-0.5 * (data.band_size * np.linalg.slogdet(S)[1]).sum()), S
+
+
+def least_noise(covariance: FloatArray) -> FloatArray:
+    """What rounding adds to a covariance (band, channel, channel)."""
+    trace = np.trace(covariance, axis1=1, axis2=2)
+    return LEAST * trace[:, None, None] * np.eye(covariance.shape[-1])
 
 
 def freedom(data: DriveData, covariance: FloatArray, spread: FloatArray) -> float:

@@ -38,7 +38,6 @@ from avtorch.gap.engine.priors import LOST_NATS, WARM_S
 LONGEST_S = 1.4
 """Longest stretch [s]: a link that is silent for longer has timed out, and the controller with it."""
 
-_EFFECT = "command_hold"
 _SWEEPS = 6  # of conditional modes; three are enough for most drives
 _ROUNDS = 3  # of stretches given parameters, parameters given stretches
 
@@ -78,7 +77,7 @@ def with_lost_messages(h: Hypothesis, mask: BoolArray | None = None) -> Hypothes
         return None
     best: Hypothesis | None = None
     for _ in range(_ROUNDS):
-        trial = h.with_effect(_EFFECT, (), None) if best is None else best.copy()
+        trial = h.with_effect("command_hold", ()) if best is None else best.copy()
         trial.lost = found.rows
         trial = fit(trial, 6)
         evaluate_evidence(trial)
@@ -113,11 +112,13 @@ def pulse_model(h: Hypothesis, mask: BoolArray | None = None) -> PulseModel:
     """The model under a hypothesis; no stretch responds in the rows of `mask` (row,)."""
     data = h.data
     information = demand_information(h, h.covariance, round(WARM_S / data.dt))
+    blocked = data.starts if mask is None else data.starts | mask
+    rows = np.where(blocked, np.arange(len(blocked)), len(blocked))
     return PulseModel(
         demand=h["K_L"] * data.command,
         information=information,
         cover=frame_cover(h),
-        free=_free_until(data.starts if mask is None else data.starts | mask),
+        free=np.ascontiguousarray(np.minimum.accumulate(rows[::-1])[::-1]),
         longest=max(1, min(round(LONGEST_S / data.dt), len(information) - 1)),
         tail=response_rows(h),
         penalty=LOST_NATS,
@@ -179,19 +180,6 @@ def _schedule(before: IntArray, value: FloatArray) -> IntArray:
 
 
 # one stretch ---------------------------------------------------------------------------------------------------------
-@njit(cache=True, error_model="numpy")
-def _free_until(blocked: BoolArray) -> IntArray:
-    """First blocked row from each row on (row,)."""
-    n = len(blocked)
-    out = np.empty(n, np.int64)
-    until = n
-    for k in range(n - 1, -1, -1):
-        if blocked[k]:
-            until = k
-        out[k] = until
-    return out
-
-
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _gains(
     m: PulseModel, score: FloatArray, backwards: FloatArray, first: int, most: int, pulse: FloatArray, out: FloatArray

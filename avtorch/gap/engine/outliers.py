@@ -27,6 +27,7 @@ from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.likelihood import HALF_LOG_2PI
 
 # suspects
 SUSPECT = 4.2
@@ -67,7 +68,6 @@ _NORMAL_SCALES = np.linspace(0.8, 2.0, 13)
 _STUDENT_SCALES, _STUDENT_DOF = np.arange(7, 13) / 10, np.array([2.5, 3, 4, 6, 9, 15, 30])
 _CORE_SCALES, _WIDTHS = np.array([0.85, 0.95, 1.05, 1.2]), np.array([3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 13.0])
 _SHARES = np.array([0.001, 0.002, 0.004, 0.008, 0.015, 0.03, 0.05, 0.08, 0.12])
-_HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 
 
 class Outliers(NamedTuple):
@@ -160,7 +160,7 @@ def rate_onset(times: FloatArray, first: float, last: float) -> tuple[float, flo
 
 
 def robust_innovations(
-    errors: FloatArray, bounds: IntArray, warm_rows: int, readings: FloatArray, order: int = ORDER
+    errors: FloatArray, bounds: IntArray, warm_rows: int, readings: FloatArray
 ) -> Innovations | None:
     """Autoregression of `errors` (row,) in the stretches between `bounds`, by iteratively reweighted least squares.
 
@@ -171,24 +171,24 @@ def robust_innovations(
     parts = [(int(i), int(j)) for i, j in zip(begins, bounds[1:], strict=True) if j - i >= 50]
     if not parts:
         return None
-    windows = [np.lib.stride_tricks.sliding_window_view(errors[i : j - 1], order) for i, j in parts]
-    design = np.column_stack([np.concatenate(windows), np.concatenate([errors[i + order : j] for i, j in parts])])
+    windows = [np.lib.stride_tricks.sliding_window_view(errors[i : j - 1], ORDER) for i, j in parts]
+    design = np.column_stack([np.concatenate(windows), np.concatenate([errors[i + ORDER : j] for i, j in parts])])
     weight = np.ones(len(design))
-    coefficients, residual, scale = np.zeros(order), design[:, -1], 1.0
+    coefficients, residual, scale = np.zeros(ORDER), design[:, -1], 1.0
     for _ in range(6):
         triangle = np.asarray(np.linalg.qr(design * weight[:, None], mode="r"))  # far smaller, with the same solution
-        coefficients = np.linalg.lstsq(triangle[:, :order], triangle[:, order])[0]
-        residual = design[:, order] - design[:, :order] @ coefficients
+        coefficients = np.linalg.lstsq(triangle[:, :ORDER], triangle[:, ORDER])[0]
+        residual = design[:, ORDER] - design[:, :ORDER] @ coefficients
         size = np.abs(residual)
         scale = 1.4826 * float(np.median(size)) + 1e-9
         # Student-like weights, steeper where errors are gross
         robust = np.where(size > 5 * scale, 0.2, 1.0) / (1 + size / (2 * scale))
-        past = np.convolve(size > 4 * scale, np.ones(order + 1))[: len(size)] > 0
+        past = np.convolve(size > 4 * scale, np.ones(ORDER + 1))[: len(size)] > 0
         weight = np.sqrt(robust) * np.where(past, 0.1, 1.0)
     levels = np.unique(np.round(readings, 5))
     if 2 < len(levels) < 0.05 * len(readings):
         scale = max(scale, QUANTUM_SCALE * float(np.median(np.diff(levels))))
-    rows = np.concatenate([np.arange(i + order, j) for i, j in parts])
+    rows = np.concatenate([np.arange(i + ORDER, j) for i, j in parts])
     return Innovations(residual / scale, rows, np.concatenate([[1.0], -coefficients[::-1]]), scale)
 
 
@@ -218,7 +218,7 @@ def additive_over_innovational(z: FloatArray, pi: FloatArray, dt: float) -> tupl
 def tail_log_likelihoods(z: FloatArray) -> tuple[float, float, float]:
     """Log likelihoods of innovations `z` (innovation,) under the best contaminated normal, Student's law, normal."""
     n, squares = len(z), float(z @ z)
-    normal = float((-0.5 * squares / _NORMAL_SCALES**2 - n * np.log(_NORMAL_SCALES)).max()) - n * _HALF_LOG_2PI
+    normal = float((-0.5 * squares / _NORMAL_SCALES**2 - n * np.log(_NORMAL_SCALES)).max()) - n * HALF_LOG_2PI
     dof, scale = _STUDENT_DOF[:, None], _STUDENT_SCALES
     peak = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * np.log(dof * math.pi) - np.log(scale)
     tails = np.log1p(np.multiply.outer(1 / (dof * scale**2), z * z)).sum(-1)
@@ -229,7 +229,7 @@ def tail_log_likelihoods(z: FloatArray) -> tuple[float, float, float]:
     a, b = 0.5 * (1 / core**2 - 1 / wide**2), core / wide
     odds = _SHARES / (1 - _SHARES)
     mixture = _sum_log1p_exp(z * z, a.ravel(), b.ravel(), odds).reshape(*a.shape, len(odds))
-    mixture += (-0.5 * squares / core**2 - n * np.log(core))[..., None] + n * np.log1p(-_SHARES) - n * _HALF_LOG_2PI
+    mixture += (-0.5 * squares / core**2 - n * np.log(core))[..., None] + n * np.log1p(-_SHARES) - n * HALF_LOG_2PI
     return float(mixture.max()), student, normal
 
 

@@ -4,6 +4,10 @@ From a set, the promise of each further effect is computed to first order: the p
 effect's response, in units of the noise, after the parameters that are in have taken what they can. The most promising
 effects are fitted, the best of them finished (delay against lag, limits, onsets), and each effect is then left out in
 turn. The answer is not the last set but the average of all visited ones (`average`).
+
+Three bases compete in the same evidence: K u, K u with a resistance R(v), and any force map F(u, v). The price of a map
+is linear, one Gram matrix for all sizes. A base is its fit: lag, gain, recorder and map together, the prior size of the
+map chosen anew from round to round, and all sizes summed in the evidence.
 """
 
 from __future__ import annotations
@@ -19,13 +23,14 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, EngineEffect, base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.evidence import evaluate_evidence
-from avtorch.gap.engine.force_base import prices, resized, with_force_map
+from avtorch.gap.engine.force_map import MAP_SIZES, MapForm, map_forms, size_log_prior
+from avtorch.gap.engine.free_forms import band_products, block, linear_evidence, map_free_form
 from avtorch.gap.engine.gauss_newton import fit, linearised, normal_prior, objective, whitened_jacobian
 from avtorch.gap.engine.gear_shifts import refined_shift_speeds, shift_speeds, upshift_rows
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import log_likelihood, whiten
+from avtorch.gap.engine.likelihood import log_likelihood, log_sum, whiten
 from avtorch.gap.engine.lost_messages import with_lost_messages
-from avtorch.gap.engine.priors import WITHIN_NATS
+from avtorch.gap.engine.priors import UNKNOWN_NATS, WITHIN_NATS
 from avtorch.gap.engine.recorder import traded
 
 _MOST_FITS, _FEWEST_FITS = 160, 40  # of a search; a hard case of five minutes takes about fifty
@@ -33,6 +38,8 @@ _GRID_FITS = 4e6  # fits times grid points: what a long drive may cost
 _WIDTH, _LATER_WIDTH, _SECOND_WIDTH = 9, 6, 4  # effects fitted from the base, from a set, on a second way in
 _FINISHED = 3  # of these, how many are finished
 _RAMPS = 10  # of a gain that changes, from a second to the drive's length
+_SIZE_ROUNDS = 3  # of fits, each with the likeliest size of the map
+_MAP_LAGS_S = (None, 0.3)  # from which a fit with a map begins: the base's own lag was fitted to a wrong force
 _MARGIN_S = 8.0  # no onset this near to an end of the drive
 _LEAST_PROMISE = 1.5  # nats: less is the gain of a parameter that does nothing
 _SLOPES = {
@@ -56,35 +63,33 @@ class Promise(NamedTuple):
 
 @dataclass(eq=False)
 class Search:
-    """A search from a fitted `base`, among `effects`; at most `most` in a set. `alone`: one channel, or the band below
-    `ONE_CHANNEL_HZ`: the car's own unnamed dynamics then belong to the base.
+    """A search from a fitted `base`, among `effects`; at most `most` in a set. With one channel the car's own unnamed
+    dynamics belong to the base.
 
-    `most_fits` bounds what it may cost (0: by the length of the drive), `stop()` ends it where it returns True;
-    `complete` tells whether one of them did. `visited` maps a set (names, and whether each has an onset; the name of
+    `most_fits` bounds what it may cost, by the length of the drive, `stop()` ends it where it returns True; `complete`
+    tells whether one of them did. `visited` maps a set (names, and whether each has an onset; the name of
     its force map) to its best hypothesis. `map_bases`: bases with a force map that sets have grown from.
     """
 
     base: Hypothesis
     effects: Collection[str] = tuple(EFFECTS)
     most: int = 4
-    alone: bool = False
-    most_fits: int = 0
     stop: Callable[[], bool] | None = None
     progress: Callable[[str, int, int], None] | None = None
     visited: dict[tuple[tuple[str, bool], ...], Hypothesis] = field(default_factory=dict)
     fits: int = 0
+    most_fits: int = field(init=False)
     complete: bool = True
     map_bases: list[Hypothesis] = field(default_factory=list)
     _shifts_refined: bool = False
 
     def __post_init__(self) -> None:
-        if not self.most_fits:
-            self.most_fits = int(np.clip(_GRID_FITS / len(self.base.data.grid.time), _FEWEST_FITS, _MOST_FITS))
+        self.most_fits = int(np.clip(_GRID_FITS / len(self.base.data.grid.time), _FEWEST_FITS, _MOST_FITS))
 
     def run(self) -> Hypothesis:
         """The best set found."""
         best = self._put(self.base)
-        if self.alone and "~linear" in self.effects:
+        if best.alone and "~linear" in self.effects:
             ways = [self._put(fit(self._add(best, "~linear", s, None, 10), 6)) for s in EFFECTS["~linear"].starts[1:]]
             free = max(ways, key=lambda h: h.score)
             if free.score > best.score:  # the car's own dynamics, without a name
@@ -188,7 +193,7 @@ class Search:
             self.visited[key] = h
         return h
 
-    def _grow(self, h: Hypothesis, width: int, iterations: int = 6) -> list[Hypothesis]:
+    def _grow(self, h: Hypothesis, width: int) -> list[Hypothesis]:
         """The most promising sets with one more effect, fitted, the best first."""
         best: dict[str, Hypothesis] = {}
         fitted: set[str] = set()
@@ -197,21 +202,21 @@ class Search:
             if effect not in best or best[effect].score < found.score:
                 best[effect] = found
 
-        for promise in promises(h, tried(h, self.effects, alone=self.alone)):
+        for promise in promises(h, tried(h, self.effects)):
             if promise.nats < _LEAST_PROMISE or self._ended():
                 break
             if promise.effect not in fitted and len(fitted) >= width:
                 continue
             fitted.add(promise.effect)
-            found = self._add(h, promise.effect, promise.start, promise.onset, iterations)
+            found = self._add(h, promise.effect, promise.start, promise.onset, 6)
             if promise.onset is not None and promise.effect in _SHARP:
                 found = refined_onset(found, promise.effect)
             better(promise.effect, self._put(found))
             if self.progress is not None:
                 self.progress("effects", min(self.fits, self.most_fits), self.most_fits)
-        if self.alone and "dead_time" in self.effects and "dead_time" not in h.effects and not self._ended():
+        if h.alone and "dead_time" in self.effects and "dead_time" not in h.effects and not self._ended():
             # other dynamics hide a delay from its promise
-            better("dead_time", self._put(self._add(h, "dead_time", (0.15,), None, iterations + 4)))
+            better("dead_time", self._put(self._add(h, "dead_time", (0.15,), None, 10)))
         if "command_hold" in self.effects and "command_hold" not in h.effects and not self._ended():
             mask = upshift_rows(h.data, h.shift_speeds) if "gear_shift" in h.effects else None
             found = with_lost_messages(h, mask)
@@ -253,7 +258,7 @@ class Search:
         while h.effects and not self._ended():
             others = []
             for e in h.effects if last else h.effects[:-1]:
-                if e == "~linear" and self.alone:
+                if e == "~linear":
                     continue
                 self.fits += 1
                 others.append(self._put(fit(h.without(e), 6)))
@@ -280,8 +285,8 @@ class Search:
             yield max((self._put(self._add(rest, e, s, None)) for s in starts), key=lambda x: x.score)
 
 
-def tried(h: Hypothesis, among: Collection[str], *, alone: bool = False) -> list[EngineEffect]:
-    """The effects that may be added to `h`, those `among` which its drives can show; `alone`: with one channel."""
+def tried(h: Hypothesis, among: Collection[str]) -> list[EngineEffect]:
+    """The effects that may be added to `h`, those `among` which its drives can show."""
     data, own = h.data, {base_name(e) for e in h.effects}
     out = []
     for e in EFFECTS.values():
@@ -291,7 +296,7 @@ def tried(h: Hypothesis, among: Collection[str], *, alone: bool = False) -> list
             continue
         if h.force is not None and e.base in h.force.takes_up:
             continue
-        if e.name == "~linear" and not alone:
+        if e.name == "~linear" and not h.alone:
             continue
         if e.name == "low_speed_creep" and (data.smooth_speed < _SLOW_MPS).mean() < 0.01:
             continue
@@ -553,3 +558,77 @@ def refined_onset(h: Hypothesis, effect: str) -> Hypothesis:
             if best is before:
                 break
     return best if best is h else fit(best, 5)
+
+
+# bases with a force map ----------------------------------------------------------------------------------------------
+class Price(NamedTuple):
+    """What a form would gain beside a hypothesis [nats], its presence paid for, and its likeliest prior size [-]."""
+
+    form: MapForm
+    nats: float
+
+    @property
+    def gains(self) -> bool:
+        """Whether the drive speaks for it at all: the odds against any map are left out."""
+        return self.nats > -UNKNOWN_NATS
+
+
+def prices(h: Hypothesis) -> list[Price]:
+    """Gains of the forms of a map beside a hypothesis with its evidence, by one linear step; none where it has one."""
+    if h.force is not None:
+        return []
+    out = []
+    for form in map_forms(h.data):
+        found = block(h, map_free_form(h, form))
+        out.append(Price(form.of_size(found.size), found.nats - UNKNOWN_NATS))
+    return out
+
+
+def with_force_map(base: Hypothesis, form: MapForm) -> Hypothesis:
+    """A base with a force map, fitted and valued; gains count over `base`, which has none."""
+    best = None
+    for lag in _MAP_LAGS_S:
+        h = base.copy()
+        h.plain, h.force, h.force_coefficients = base, form, np.zeros(form.count)
+        if lag is not None:
+            h["T_L"] = lag
+        fit(h, 10)
+        if best is None or objective(h) > objective(best):
+            best = h
+    assert best is not None
+    for _ in range(_SIZE_ROUNDS):
+        before = best.force
+        best = resized(best)
+        if before is not None and best.force is not None and before.size == best.force.size:
+            break
+    best.base = best
+    return evaluate_evidence(best)
+
+
+def resized(h: Hypothesis) -> Hypothesis:
+    """The fitted hypothesis with the likeliest prior size of its map, changed in place: effects that do what the map
+    did leave a smaller one. One without a map stays as it is."""
+    if h.force is None:
+        return h
+    for _ in range(2):
+        nats, size = _of_sizes(h), h.force.size
+        k = int(np.argmax(nats))
+        h.force = h.force.of_size(float(MAP_SIZES[k]), log_sum(nats) - float(nats[k]))
+        if h.force.size == size:
+            break
+        fit(h, 5, 0.1)
+    return h
+
+
+def _of_sizes(h: Hypothesis) -> FloatArray:
+    """Log evidence and log prior (size,) [nats] of each of `MAP_SIZES`, of a map linear around where it is."""
+    assert h.force is not None
+    slopes, precision, pull = linearised(h, h.free)
+    products = band_products(h.data, np.concatenate([h.residual[None], slopes]))
+    b, n = h.force_coefficients, len(h.free)
+    nats = []
+    for size in MAP_SIZES:
+        precision[n:], pull[n:] = size**-2, -b / size**2
+        value, _ = linear_evidence(h, products, precision, pull, 8, integrated=True)
+        nats.append(value - 0.5 * float(b @ b) / size**2 - len(b) * np.log(size))
+    return np.array(nats) + size_log_prior()

@@ -110,17 +110,15 @@ def shape_likelihood(
     residual: FloatArray,
     energy: FloatArray | None,
     iterations: int = 30,
-    fmax: float | None = None,
 ) -> ShapeLikelihood | None:
     """Likelihood of each of `RELATIVE_ERRORS` in the effects behind a residual (channel, frame, bin).
 
     `energy` (frame, band, channel, channel): of the effects, `effect_energy`; without effects (None), there is no
-    shape to be wrong, and the answer is None. `iterations` over the noise: 30 come within half a nat. `fmax` [Hz]:
-    bands that begin below it count.
+    shape to be wrong, and the answer is None. `iterations` over the noise: 30 come within half a nat.
     """
     if energy is None:
         return None
-    bands = claim_bands(data, fmax)
+    bands = claim_bands(data)
     observed = frame_energy(data, residual)[:, :bands]
     sizes = np.diff(data.band_edges)[:bands].astype(float)
     channels = residual.shape[0]
@@ -132,17 +130,17 @@ def shape_likelihood(
     return ShapeLikelihood(total - total[0], np.ascontiguousarray(unpacked), counts)
 
 
-def shape_log_odds(relative: float, gain: float, effects: Iterable[str], temper: float = TEMPER) -> float:
+def shape_log_odds(relative: float, gain: float, effects: Iterable[str]) -> float:
     """Log odds that a companion is an error in the shape of `effects` rather than a cause of its own.
 
     `relative`: its `relative_size`; `gain` [nats]: what it adds to the evidence. The density of an error of shape is
     half-normal, that of a cause's size is one per unit of relative size. The likelihood is later raised to the power
-    `temper`, a prior is not: its logarithm is divided by that power in advance. A companion that gains nothing
+    `TEMPER`, a prior is not: its logarithm is divided by that power in advance. A companion that gains nothing
     has no measured size, so its density narrows nothing down: the odds in its favour are at most its gain.
     """
     scale = error_scale(effects)
     log_density_at_zero = 0.5 * math.log(2.0 / math.pi) - math.log(scale)
-    return min(log_density_at_zero / temper, max(gain, 0.0)) - 0.5 * (relative / scale) ** 2 / temper
+    return min(log_density_at_zero / TEMPER, max(gain, 0.0)) - 0.5 * (relative / scale) ** 2 / TEMPER
 
 
 def _packed(energy: FloatArray, alone: float) -> FloatArray:

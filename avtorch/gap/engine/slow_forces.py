@@ -30,6 +30,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numba import njit
@@ -140,27 +141,31 @@ def road_spectrum(frequency: FloatArray, corner: float | FloatArray) -> FloatArr
     return 1 / (1 + (frequency / end) ** ROAD_STEEPNESS) / (width * end)
 
 
+_RESPONSES: WeakKeyDictionary[DriveData, BandResponse] = WeakKeyDictionary()
+
+
 def band_response(data: DriveData) -> BandResponse:
-    """The response of bands below `SLOW_HZ` to tones of any phase; kept in `data.cache`.
+    """The response of bands below `SLOW_HZ` to tones of any phase; computed once.
 
     A coefficient is sum_n h_n x_n; of a stationary x its mean square is int S(f) |H(f)|² df, H the Fourier transform of
     its row h of the transform. Its real and imaginary parts are the coefficients of a cosine and a sine.
     """
-    if "slow_band_response" not in data.cache:
-        edges = data.band_edges
-        bands = min(int(np.searchsorted(data.frequency[edges[:-1]], SLOW_HZ)), data.band_count)
-        M = data.frame_rows
-        h = M // 2
-        tones = _tones(float(data.frequency[1] - data.frequency[0]))
-        phase = 2 * np.pi * tones[:, None] * np.arange(2 * M) * data.dt
-        w = np.concatenate([np.cos(phase), np.sin(phase)]) * data.window
-        folded = np.concatenate([-w[:, M + h - 1 : M - 1 : -1] - w[:, M + h :], w[:, :h] - w[:, M - 1 : h - 1 : -1]], 1)
-        squares = np.asarray(dct(folded, type=4, norm="ortho", axis=1))[:, : edges[bands]] ** 2
-        each = squares[: len(tones)] + squares[len(tones) :]
-        energy = np.add.reduceat(each, edges[:bands], axis=1) / np.diff(edges[: bands + 1])
-        steps = np.diff(tones, prepend=tones[0], append=tones[-1])
-        data.cache["slow_band_response"] = BandResponse(tones, energy.T * 0.5 * (steps[1:] + steps[:-1]))
-    return data.cache["slow_band_response"]
+    if data in _RESPONSES:
+        return _RESPONSES[data]
+    edges = data.band_edges
+    bands = min(int(np.searchsorted(data.frequency[edges[:-1]], SLOW_HZ)), data.band_count)
+    M = data.frame_rows
+    h = M // 2
+    tones = _tones(float(data.frequency[1] - data.frequency[0]))
+    phase = 2 * np.pi * tones[:, None] * np.arange(2 * M) * data.dt
+    w = np.concatenate([np.cos(phase), np.sin(phase)]) * data.window
+    folded = np.concatenate([-w[:, M + h - 1 : M - 1 : -1] - w[:, M + h :], w[:, :h] - w[:, M - 1 : h - 1 : -1]], 1)
+    squares = np.asarray(dct(folded, type=4, norm="ortho", axis=1))[:, : edges[bands]] ** 2
+    each = squares[: len(tones)] + squares[len(tones) :]
+    energy = np.add.reduceat(each, edges[:bands], axis=1) / np.diff(edges[: bands + 1])
+    steps = np.diff(tones, prepend=tones[0], append=tones[-1])
+    _RESPONSES[data] = BandResponse(tones, energy.T * 0.5 * (steps[1:] + steps[:-1]))
+    return _RESPONSES[data]
 
 
 # likelihoods of a common power ----------------------------------------------------------------------------------------

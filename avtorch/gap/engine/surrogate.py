@@ -13,7 +13,6 @@ of SGLD).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import cast
 
 import numpy as np
@@ -24,6 +23,7 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.density import HypothesisDensity, WithScore, of_products, pairs
 from avtorch.gap.engine.evidence import log_prior
+from avtorch.gap.engine.free_forms import band_products
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +54,9 @@ class Surrogate:
         for k, own in enumerate(x):
             values[at] = own
             columns += np.multiply.outer(weight[:, k], data.measured - h.response(values))
-        gram = np.empty((len(weight), data.band_count, len(pairs(data)), len(weight)))
-        for band, (begin, end) in enumerate(pairwise(data.band_edges.tolist())):
-            flat = columns[..., begin:end].reshape(len(weight), data.channel_count, -1)
-            for pair, (i, j) in enumerate(pairs(data)):
-                product = flat[:, i] @ flat[:, j].T
-                gram[:, band, pair] = 0.5 * (product + product.T)
+        products = band_products(data, columns)
+        each = np.stack([products[:, i, j] for i, j in pairs(data)], 1)  # band, pair, term, term
+        gram = np.ascontiguousarray(np.moveaxis(0.5 * (each + each.swapaxes(-1, -2)), -2, 0))
         return cls(density, centre, scale, torch.as_tensor(gram), z.mean(0), _root(z))
 
     @property

@@ -1,4 +1,4 @@
-"""The plant of a hypothesis in torch: batched over values of its coordinates, differentiable, with onsets.
+"""The plant of a hypothesis and its recorder in torch: batched over values of coordinates, differentiable.
 
 It runs the simulator's own effects and actuator on the grid of a drive, stretch by stretch; a test holds it to the
 compiled plant. An effect that sets in later is neutral until then. One whose memory would have filled by then (a play,
@@ -6,6 +6,9 @@ a sensor's filter) begins there at rest; an actuator that changes is cut in two 
 acceleration which the first has reached.
 
 Where a user's own effect or baseline takes part, the simulator responds as a whole.
+
+The recorder (`recorded`) is the twin of `Hypothesis.recorded` and `DriveData.transform`, with gradients in the signals
+and in delays and filters. A delay reads between points of the grid, so that its gradient jumps where a row passes one.
 """
 
 from __future__ import annotations
@@ -13,17 +16,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from avtorch.errors import InputError
+from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.effects import DrivelineOscillation
 from avtorch.gap.engine.car import drives_of, plant_of, table_effect
 from avtorch.gap.engine.compiled_plant import _FREE_DAMPING
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, NEUTRAL, Coordinate, base_name
+from avtorch.gap.engine.drive_data import UNKNOWN_SPEED_MPS, DriveData, filtered
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.simulator.actuator import Actuator, Substep
 from avtorch.gap.simulator.chain import at_place, in_order, substeps
@@ -66,10 +72,7 @@ def not_in_torch(h: Hypothesis) -> str:
 
 
 def torch_plant(h: Hypothesis) -> TorchPlant | SimulatorPlant:
-    """The plant of a hypothesis. Raises `InputError` where `not_in_torch` has a reason."""
-    why = not_in_torch(h)
-    if why:
-        raise InputError(f"hypothesis: {why}, needs effects from the start")
+    """The plant of a hypothesis for which `not_in_torch` has no reason against it."""
     return SimulatorPlant.of(h) if _by_the_simulator(h) else TorchPlant.of(h)
 
 
@@ -102,50 +105,31 @@ class SimulatorPlant:
 
 
 @dataclass(frozen=True, eq=False)
-class _Stretch:
-    """Steps (grid,) of one stretch, and the car's acceleration at its first row [m/s²]."""
-
-    row: EffectContext
-    command: Tensor
-    accel0: Tensor
-
-
-@dataclass(frozen=True, eq=False)
 class TorchPlant:
     """`Hypothesis.on_grid` for tensors of values; `acting`: effects, those of the user's baseline among them."""
 
     hypothesis: Hypothesis
     acting: tuple[str, ...]
-    stretches: tuple[_Stretch, ...]
+    drives: tuple[SimulatorInput, ...]
 
     @classmethod
     def of(cls, h: Hypothesis) -> TorchPlant:
-        grid = h.data.grid
-        begins = np.flatnonzero(grid.starts).tolist()
-        command = h.command()[grid.row]
-        stretches = []
-        for i, j in zip(begins, [*begins[1:], len(grid.time)], strict=True):
-            time, none = torch.as_tensor(grid.time[i:j]), torch.zeros(1, dtype=torch.float64)
-            steps = time.diff()
-            uniform = bool((steps - steps.mean()).abs().max() <= 1e-6 * steps.mean())
-            dt = (time[-1] - time[0]) / (j - i - 1) if uniform else torch.cat([steps, steps[-1:]])
-            row = EffectContext(time, dt, torch.as_tensor(grid.speed[i:j]), None, none, none)
-            accel0 = torch.tensor(grid.accel0[i], dtype=torch.float64)
-            stretches.append(_Stretch(row, torch.as_tensor(command[i:j]), accel0))
-        return cls(h, tuple(_acting(h)), tuple(stretches))
+        return cls(h, tuple(_acting(h)), tuple(drives_of(h)))
 
     def on_grid(self, values: Values) -> tuple[Tensor, Tensor]:
         """The accelerometer's reading [m/s²] and the speed's reading gained in its stretch [m/s], (column, grid) each.
 
         `values`: every coordinate of the vector that differs from the hypothesis's, `T_L` among them.
         """
-        parts = [self._over(stretch, values) for stretch in self.stretches]
+        parts = [self._over(drive, values) for drive in self.drives]
         accel, gained = zip(*parts, strict=True)
         return torch.cat(accel, -1), torch.cat(gained, -1)
 
-    def _over(self, stretch: _Stretch, values: Values) -> tuple[Tensor, Tensor]:
-        steps, columns = len(stretch.command), values["T_L"].shape
-        row = replace(stretch.row, T_L=values["T_L"][..., None], K_L=values["K_L"][..., None])
+    def _over(self, drive: SimulatorInput, values: Values) -> tuple[Tensor, Tensor]:
+        steps, columns = len(drive.time), values["T_L"].shape
+        speed = torch.full_like(drive.time, UNKNOWN_SPEED_MPS) if drive.speed is None else drive.speed
+        dt = drive.dt[0] if drive.uniform else drive.dt
+        row = EffectContext(drive.time, dt, speed, None, values["T_L"][..., None], values["K_L"][..., None])
         late: dict[str, int] = {}
         effects = []
         for name in self.acting:
@@ -163,8 +147,8 @@ class TorchPlant:
             after = e.over(x[..., before:], rest)
             return torch.cat([x[..., :before].expand(*after.shape[:-1], -1), after], -1)
 
-        parts = substeps(chain, stretch.command, row, hook)
-        accel0, at = stretch.accel0.expand(columns), context_at(row, 0)
+        parts = substeps(chain, drive.command, row, hook)
+        accel0, at = torch.as_tensor(drive.accel0).expand(columns), context_at(row, 0)
         actuator0 = accel0
         for e in at_place(chain, "body"):  # the actuator's share is the car's acceleration less the other forces
             first = e.replaced({key: value[..., 0] for key, value in e.values().items()})
@@ -227,3 +211,111 @@ def _actuated(
         accels.append(a[..., 1:])
         gains.append(gained)
     return torch.cat(accels, -1), torch.cat(gains, -1)
+
+
+# the recorder --------------------------------------------------------------------------------------------------------
+def recorded(data: DriveData, accel: Tensor, gained: Tensor, values: Values) -> Tensor:
+    """Coefficients (column, channel, frame, bin) of a reading and a gained speed, (column, grid) each.
+
+    `values` holds each channel's delay and filter [s], (column,).
+    """
+    shown = []
+    if data.accel is not None:
+        a = _low_pass(data, _late(data, accel, values["accel_delay"]), values["accel_filter"])
+        shown.append(_read(a, *map(torch.as_tensor, data.aligned_at)) if data.align_s else a)
+    if data.speed is not None:
+        v = _low_pass(data, _late(data, gained, values["speed_delay"]), values["speed_filter"])
+        v = v if data.hold == 1 else _read(v, *map(torch.as_tensor, data.held_at))
+        rate, middle = map(torch.as_tensor, data.difference_tables)
+        shown.append(((v[..., 2:] - v[..., :-2]) * rate)[..., middle])
+    return cast(Tensor, _Transform.apply(torch.stack(shown, -2), data))
+
+
+def _low_pass(data: DriveData, x: Tensor, time_constant: Tensor) -> Tensor:
+    """`DriveData.low_pass`."""
+    tau, step = time_constant.clamp_min(1e-4)[..., None], torch.as_tensor(data.gaps[1])
+    keep = torch.exp(-step / tau)
+    held = tau / step * (1 - keep)
+    none = (time_constant < 1e-4)[..., None]
+    pole = [torch.where(none, x, y) for x, y in ((0.0, keep), (1.0, 1 - held), (0.0, held - keep))]
+    return cast(Tensor, _OnePole.apply(x, *pole, data))
+
+
+def _late(data: DriveData, x: Tensor, delay: Tensor) -> Tensor:
+    """`compiled_plant.read_late`."""
+    time, at = torch.as_tensor(data.grid.time), torch.as_tensor(data.time) - delay[..., None]
+    index = (torch.searchsorted(time, at.detach().contiguous(), right=True) - 1).clamp(0, len(time) - 2)
+    begin = time[index]
+    return _read(x, index, ((at - begin) / (time[index + 1] - begin)).clamp(0.0, 1.0))
+
+
+def _read(x: Tensor, index: Tensor, share: Tensor) -> Tensor:
+    """`x` (column, point) linearly between points."""
+    index = index.expand(*x.shape[:-1], index.shape[-1])
+    low = x.gather(-1, index)
+    return low + share * (x.gather(-1, index + 1) - low)
+
+
+class _OnePole(torch.autograd.Function):
+    """`drive_data.filtered`; x (column, row), coefficients (column, gap)."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, keep: Tensor, new: Tensor, old: Tensor, data: DriveData) -> Tensor:
+        rows, pole = x.detach().numpy(), [c.detach().numpy() for c in (keep, new, old)]
+        y = np.array([filtered(row, data.bounds, data.gaps[0], *own) for row, *own in zip(rows, *pole, strict=True)])
+        ctx.x, ctx.y, ctx.pole, ctx.data = rows, y, pole, data
+        return torch.as_tensor(y)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        data, on_x, on_pole = ctx.data, [], []
+        for g, x, y, *pole in zip(gradient.numpy(), ctx.x, ctx.y, *ctx.pole, strict=True):
+            for into, one in zip((on_x, on_pole), _adjoint(g, x, y, data.bounds, data.gaps[0], *pole), strict=True):
+                into.append(one)
+        return torch.as_tensor(np.array(on_x)), *torch.as_tensor(np.array(on_pole)).movedim(1, 0), None
+
+
+@njit(cache=True, error_model="numpy")
+def _adjoint(
+    g: FloatArray,
+    x: FloatArray,
+    y: FloatArray,
+    bounds: IntArray,
+    gaps: IntArray,
+    keep: FloatArray,
+    new: FloatArray,
+    old: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Gradients on x (row,) and on the coefficients (keep, new, old; gap) of `drive_data.filtered`, from `g` (row,)."""
+    on_x, on_pole = np.zeros(len(x)), np.zeros((3, len(keep)))
+    for s in range(len(bounds) - 1):
+        costate = 0.0
+        for i in range(bounds[s + 1] - 1, bounds[s], -1):
+            k = gaps[i]
+            costate += g[i]
+            on_x[i] += new[k] * costate
+            on_x[i - 1] += old[k] * costate
+            on_pole[0, k] += costate * y[i - 1]
+            on_pole[1, k] += costate * x[i]
+            on_pole[2, k] += costate * x[i - 1]
+            costate *= keep[k]
+        on_x[bounds[s]] += costate + g[bounds[s]]
+    return on_x, on_pole
+
+
+class _Transform(torch.autograd.Function):
+    """Rows (..., row) as coefficients (..., frame, bin), a linear map."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, data: DriveData) -> Tensor:
+        ctx.data = data
+        flat = data.transform(list(rows.detach().reshape(-1, rows.shape[-1]).numpy()))
+        return torch.as_tensor(flat).reshape(*rows.shape[:-1], *flat.shape[1:])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        flat = gradient.reshape(-1, *gradient.shape[-2:]).numpy()
+        rows = np.stack([ctx.data.adjoint(x) for x in flat])
+        return torch.as_tensor(rows).reshape(*gradient.shape[:-2], -1), None

@@ -57,7 +57,7 @@ def test_interruptions_are_those_of_the_effect(fresh_seed: int) -> None:
     h = Hypothesis(DriveData.of(Log.from_arrays(time=time, accel_cmd=command, accel=command, speed=speed)))
     h["K_L"] = 1.0
     data = h.evaluate().data
-    likelihood = _PulseLikelihood.of(h, h.residual)
+    likelihood = _PulseLikelihood.of(h)
     level, rearm, duration = 5.1, float(rng.uniform(0.2, 1.2)), float(rng.uniform(0.1, 0.6))
     pulses = likelihood.pulses(likelihood.upshifts(level, rearm), duration)
     lost = np.zeros(len(data.time))
@@ -134,7 +134,7 @@ def _with_shifts(h: Hypothesis, speeds: FloatArray) -> Hypothesis:
 
 def test_gains_are_those_of_the_simulated_response(fresh_seed: int) -> None:
     h = _fitted(_log(np.random.default_rng(fresh_seed)))
-    likelihood = _PulseLikelihood.of(h, h.residual)
+    likelihood = _PulseLikelihood.of(h)
     weights = precision(h.data, h.covariance)
 
     def inner(x: FloatArray, y: FloatArray) -> float:
@@ -156,7 +156,7 @@ def test_gains_are_those_of_the_simulated_response(fresh_seed: int) -> None:
         pulses = likelihood.pulses(likelihood.upshifts(level, h["shift_hysteresis"]), 0.35)
         # log L along the response is off by less than a tenth of the noise that it has anyhow
         assert abs(likelihood.gain(likelihood.score, pulses) - slope) <= 0.1 * np.sqrt(size)
-        sizes += likelihood.size(pulses).own
+        sizes += pulses.size
         expected += size
     # the information is the mean over the places of pulses in frames: 25 % each, of some 20 upshifts
     assert sizes == pytest.approx(expected, rel=0.25)
@@ -164,13 +164,13 @@ def test_gains_are_those_of_the_simulated_response(fresh_seed: int) -> None:
 
 def test_taking_pulses_out_leaves_the_score_beside_them(fresh_seed: int) -> None:
     h = _fitted(_log(np.random.default_rng(fresh_seed)))
-    likelihood = _PulseLikelihood.of(h, h.residual)
+    likelihood = _PulseLikelihood.of(h)
     pulses = likelihood.pulses(likelihood.upshifts(8.1, 0.8), 0.4)
-    size, score = likelihood.size(pulses), likelihood.score.copy()
-    likelihood.take_out(score, pulses, size, 0.3)
+    score = likelihood.score.copy()
+    likelihood.take_out(score, pulses, 0.3)
     fallen = likelihood.gain(likelihood.score, pulses) - likelihood.gain(score, pulses)
-    assert fallen == pytest.approx(0.3 * size.own, rel=1e-9)
-    likelihood.take_out(score, pulses, size, -0.3)
+    assert fallen == pytest.approx(0.3 * pulses.size, rel=1e-9)
+    likelihood.take_out(score, pulses, -0.3)
     np.testing.assert_allclose(score, likelihood.score, atol=1e-9 * np.abs(score).max())
 
 

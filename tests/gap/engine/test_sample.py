@@ -10,13 +10,19 @@ import pytest
 import torch
 from scipy import stats
 
-from avtorch.errors import InputError
 from avtorch.gap import Backlash, DeadTime, SecondOrderActuator, SensorBias, SensorScale, SpeedDependentGain
 from avtorch.gap.engine.density import HypothesisDensity
 from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.laplace import Laplace, reflected, truncated_normal
-from avtorch.gap.engine.sample import corrected, fitted, sample, stein_discrepancy
+from avtorch.gap.engine.sample import (
+    Laplace,
+    corrected,
+    fitted,
+    reflected,
+    sample,
+    stein_discrepancy,
+    truncated_normal,
+)
 from avtorch.gap.engine.surrogate import Corrected
 from avtorch.inference.density import SubsampledDensity
 from avtorch.inference.priors import LogSpaceNormal
@@ -253,8 +259,3 @@ def test_a_surrogate_that_is_far_off_has_no_gradients():
     density, surrogate, mode, generator = parts_of(a_fit("sensor_bias"))
     off = type(surrogate)(density, surrogate.centre + 40 * surrogate.scale.sum(1), *list(vars(surrogate).values())[2:])
     assert corrected(density, off, mode, 1.0, generator) is None
-
-
-def test_too_few_draws_are_refused():
-    with pytest.raises(InputError, match="draws"):
-        sample(a_fit("sensor_bias"), draws=2)

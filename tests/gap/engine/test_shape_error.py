@@ -12,7 +12,7 @@ from avtorch import Log
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.likelihood import claim_bands
-from avtorch.gap.engine.priors import SHAPE_ERROR, TEMPER
+from avtorch.gap.engine.priors import SHAPE_ERROR
 from avtorch.gap.engine.shape_error import (
     RELATIVE_ERRORS,
     _geometric_mean,
@@ -181,8 +181,6 @@ def test_companion_is_an_error_of_shape_while_it_is_small() -> None:
     even = SHAPE_ERROR * math.sqrt(2 * math.log(math.sqrt(2 / math.pi) / SHAPE_ERROR))
     assert shape_log_odds(even, far, ["dead_time"]) == pytest.approx(0.0, abs=1e-9)
     assert shape_log_odds(0.3, far, ["command_hold"]) > odds[3]
-    # tempered later: the odds are those of the density whatever the power is
-    assert TEMPER * odds[4] == pytest.approx(0.5 * shape_log_odds(1.0, far, ["dead_time"], 0.5))
 
 
 @pytest.mark.parametrize("gain", [-3.0, 0.0, 2.0])
