@@ -179,13 +179,6 @@ def _picture(answer: Answer) -> Picture | None:
     # draws, and needs matplotlib
     from avtorch.plots.fleet import FEW, fleet_figure
 
-    ends = {name: [f(car[name]["mean"] for car in known) for f in (min, max)] for name in ("T_L", "K_L")}
-    below = sum(car["p_string_stable"]["now"] < answer["target"] for car in known)
-    says = (
-        f"{many(len(known), 'car')}: T_L {ends['T_L'][0]:.2f} to {ends['T_L'][1]:.2f} s, "
-        f"K_L {ends['K_L'][0]:.2f} to {ends['K_L'][1]:.2f}. Beside it the share of cars up to each P(string stable): "
-        f"{below} are below the target of {answer['target']:g}."
-    )
     each = "each with its 90 % intervals" if len(known) <= FEW else "a square's area is its number of cars"
     ranks = "; numbers are ranks" if len(known) <= FEW else ""
     caption = (
@@ -193,7 +186,7 @@ def _picture(answer: Answer) -> Picture | None:
         f"blue: the others{ranks}. Second: the share of cars up to each P(string stable)."
     )
     draw = lambda narrow: fleet_figure(answer, narrow=narrow)  # noqa: E731
-    return picture_of("fleet", draw, says, stability_table(answer), caption=caption)
+    return picture_of("fleet", draw, stability_table(answer), caption=caption)
 
 
 def _method(answer: Answer) -> list[str]:
@@ -344,9 +337,9 @@ def size_table(answer: Answer) -> Table:
     return Table("How large causes are", columns, rows, numeric=("cars", "drives"))
 
 
-def _some(cars: Sequence[str], most: int = 5) -> str:
-    more = f" and {len(cars) - most} more" if len(cars) > most else ""
-    return ", ".join(cars[:most]) + more
+def _some(cars: Sequence[str]) -> str:
+    more = f" and {len(cars) - 5} more" if len(cars) > 5 else ""
+    return ", ".join(cars[:5]) + more
 
 
 def stability_table(answer: Answer) -> Table:

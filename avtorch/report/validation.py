@@ -26,15 +26,6 @@ _TITLES = {
 }
 """Of the sections, by picture, in their order."""
 _REFERENCES = {"nuts": "NUTS", "quadrature": "exact quadrature"}
-_SAYS = {
-    "agreement": "Dots, one a window: how far SGLD's mean and SD are from the reference's, over the width of the "
-    "posterior, with the limits asked for.",
-    "marginals": "Exact densities of each parameter with histograms of the draws of SGLD and of NUTS.",
-    "joint": "Clouds of SGLD's draws of lag and gain within the 50 and 90 % regions of the references.",
-    "ranks": "Bars of the ranks of groups of chains in the pool of all draws, as many as are effective.",
-    "ecdf": "Lines of the share of draws below each exact probability, less what it should be, with the band that "
-    "chance explains.",
-}
 
 
 def validation_html(found: Validation, *, origin: Origin | None = None) -> str:
@@ -65,7 +56,6 @@ def _pictures(found: Validation) -> dict[str, Picture]:
         name: picture_of(
             name,
             lambda narrow, name=name: by_width[narrow][f"{name}.png"](),
-            _SAYS[name],
             tables[name],
         )
         for name in _TITLES
