@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import Group, Parameter
+from cyclopts import Group
 from rich.markup import escape
 
 from avtorch.cli import arguments as arg
@@ -182,11 +182,11 @@ def check_simulator(
     simulator: str,
     /,
     *,
-    T: Annotated[float | None, Parameter(name="--T", group=BELIEVED, help="Lag [s].")] = None,
-    K: Annotated[float | None, Parameter(name="--K", group=BELIEVED, help="Gain.")] = None,
-    delay: Annotated[float | None, Parameter(group=BELIEVED, help="Dead time [s].")] = None,
-    step: Annotated[float, Parameter(help="Step of the manoeuvres [s].")] = 0.02,
-    mapping: Annotated[Path | None, Parameter(help="TOML file with an FMU's variables.")] = None,
+    T: Annotated[float | None, arg.option("Lag [s].", BELIEVED, name="--T")] = None,
+    K: Annotated[float | None, arg.option("Gain.", BELIEVED, name="--K")] = None,
+    delay: Annotated[float | None, arg.option("Dead time [s].", BELIEVED)] = None,
+    step: Annotated[float, arg.option("Step of the manoeuvres [s].")] = 0.02,
+    mapping: Annotated[Path | None, arg.option("TOML file with an FMU's variables.")] = None,
     json: arg.Json = False,
     quiet: arg.Quiet = False,
 ) -> None:

@@ -184,7 +184,7 @@ def where_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     the named parts. Raises `InputError` where there are no traces."""
     traces = traces_of(found)
     axes: dict[Axis, FloatArray | None] = {"time": traces.time, "speed": traces.speed, "command": traces.command}
-    there = {axis: x for axis, x in axes.items() if x is not None}
+    there: dict[Axis, FloatArray] = {axis: x for axis, x in axes.items() if x is not None}
     figure, panels = panels_of(len(there), 2.6, narrow=narrow)
     for i, (ax, (axis, x)) in enumerate(zip(panels, there.items(), strict=True)):
         low, high = np.quantile(x, (0.002, 0.998))

@@ -142,14 +142,7 @@ def manoeuvre_name(found: Diagnosis, one: Manoeuvre) -> str:
 
 def manoeuvre_table(found: Diagnosis, each: Sequence[Manoeuvre]) -> Table:
     """Peak, rise, lag, and the band about the measured acceleration that holds most of a manoeuvre."""
-    columns = (
-        "manoeuvre",
-        "signal",
-        "peak [m/s²]",
-        "rise, 10 to 90 % [s]",
-        "lag behind the command [s]",
-        "band [m/s²]",
-    )
+    columns = ("manoeuvre", "signal", "peak [m/s²]", "rise [s]", "lag [s]", "band [m/s²]")
     rows = []
     for one in each:
         for name, response in one.responses.items():
@@ -158,7 +151,10 @@ def manoeuvre_table(found: Diagnosis, each: Sequence[Manoeuvre]) -> Table:
             if name not in ("command", "measured"):
                 band = f"±{np.quantile(np.abs(one.lines[name] - one.lines['measured']), BAND):.2g}"
             rows.append((manoeuvre_name(found, one), name, f"{response.peak:.2f}", *times, band))
-    caption = f"Manoeuvres in which the baseline errs most; a band holds {100 * BAND:.0f} % of the rows"
+    caption = (
+        "Manoeuvres in which the baseline errs most: rise from 10 to 90 %, lag behind the command, and the band that "
+        f"holds {100 * BAND:.0f} % of the rows"
+    )
     return Table(caption, columns, tuple(rows), numeric=columns[2:])
 
 

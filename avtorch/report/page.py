@@ -213,7 +213,9 @@ def _tables_of(figure: Figure) -> tuple[Table, ...]:
     from avtorch.plots.style import lines_of
 
     tables = []
+    # axes beside or above each other share a label
     along = next(text for ax in reversed(figure.axes) if (text := ax.get_xlabel()))
+    across = next(text for ax in figure.axes if (text := ax.get_ylabel()))
     for ax in figure.axes:
         lines = lines_of(ax)
         if lines:
@@ -221,7 +223,7 @@ def _tables_of(figure: Figure) -> tuple[Table, ...]:
             points = [next(iter(lines.values()))[:, 0], *(values[:, 1] for values in lines.values())]
             some = list(zip(*points, strict=True))[:: -(-len(points[0]) // _MOST)]
             rows = tuple((f"{x:.4g}", *(f"{y:.3g}" for y in ys)) for x, *ys in some)
-            tables.append(Table(f"{ax.get_ylabel()} over {columns[0]}", columns, rows, numeric=columns))
+            tables.append(Table(f"{ax.get_ylabel() or across} over {columns[0]}", columns, rows, numeric=columns))
     return tuple(tables)
 
 
