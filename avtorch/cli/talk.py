@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.segment import Segment
+from rich.status import Status
 from rich.table import Table as Drawn
 
 from avtorch.errors import printable
@@ -63,14 +64,9 @@ class Talk:
         finally:
             bar.close()
 
-    @contextmanager
-    def waiting(self, what: str) -> Iterator[None]:
-        """A sign of life on a terminal."""
-        if self.err.is_terminal:
-            with self.err.status(what):
-                yield
-        else:
-            yield
+    def waiting(self, what: str) -> Status:
+        """A sign of life on a terminal, for as long as its `with` lasts."""
+        return self.err.status(what)
 
     def notes(self, title: str, notes: Sequence[str]) -> None:
         """A title and lines below it."""

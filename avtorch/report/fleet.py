@@ -229,7 +229,7 @@ def ranking_row(car: Answer) -> tuple[str, ...]:
         str(car["rank"]),
         car["reason"],
         "" if stable is None else f"{stable['now']:.3f}",
-        *("" if car[name] is None else _interval(car[name], "mean") for name in ("T_L", "K_L")),
+        *("" if car[name] is None else _interval(car[name]) for name in ("T_L", "K_L")),
         _change(car["change"]),
         _siblings(car["siblings"]),
         lacks,
@@ -272,9 +272,12 @@ def _small(p: float) -> str:
     return "<1e-12" if p < 1e-12 else f"{p:.2g}"
 
 
-def _interval(q: Mapping[str, float], middle: str) -> str:
-    centre, low, high = (f"{q[key]:.2f}" for key in (middle, "q05", "q95"))
-    return f"{centre} ({low} to {high})"
+def _interval(q: Mapping[str, float], form: str = ".2f") -> str:
+    """A mean, or else a median, and its 90 %; by a `form` that ends with % in per cent."""
+    scale, unit = (100, " %") if form.endswith("%") else (1, "")
+    centre = q["mean"] if "mean" in q else q["median"]
+    middle, low, high = (format(scale * x, form.rstrip("%")) for x in (centre, q["q05"], q["q95"]))
+    return f"{middle}{unit} ({low} to {high})"
 
 
 def population_table(answer: Answer) -> Table:
@@ -284,21 +287,16 @@ def population_table(answer: Answer) -> Table:
     rows = tuple(
         (
             {"T_L": "T_L [s]", "K_L": "K_L"}[name],
-            _interval(common[name]["typical"], "median"),
-            _percent(common[name]["between"]),
+            _interval(common[name]["typical"]),
+            _interval(common[name]["between"], ".3g%"),
             "not told apart: no car has two drives"
             if common[name]["within"] is None
-            else _percent(common[name]["within"]),
+            else _interval(common[name]["within"], ".3g%"),
         )
         for name in _UNITS
         if name in common
     )
     return Table("The model's cars", columns, rows)
-
-
-def _percent(q: Mapping[str, float]) -> str:
-    middle, low, high = (f"{100 * q[key]:.3g}" for key in ("median", "q05", "q95"))
-    return f"{middle} % ({low} to {high})"
 
 
 def cause_table(answer: Answer) -> Table:
@@ -310,7 +308,7 @@ def cause_table(answer: Answer) -> Table:
             one["verdict"],
             f"{one['cars']} of {one['diagnosed']}",
             f"{one['may']} of {one['diagnosed']}",
-            "{:.0f} % ({:.0f} to {:.0f})".format(*(100 * one["share"][key] for key in ("mean", "q05", "q95"))),
+            _interval(one["share"], ".0f%"),
             _some(one["of"] or ()),
         )
         for one in answer["causes"]
@@ -326,7 +324,7 @@ def size_table(answer: Answer) -> Table:
         (
             cause["name"],
             f"{name} [{of['unit']}]",
-            "{:.3g} ({:.3g} to {:.3g})".format(*(of["typical"][key] for key in ("median", "q05", "q95"))),
+            _interval(of["typical"], ".3g"),
             "{:.3g} to {:.3g}".format(*(of["next_car"][key] for key in ("q05", "q95"))),
             str(of["cars"]),
             str(of["drives"]),
