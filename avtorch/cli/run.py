@@ -126,10 +126,11 @@ def _unwatched(loop: ClosedLoop, seconds: float, change_at: float, change: Calla
     """The same drive without a monitor."""
     from avtorch.vehicle import Block
 
-    turn = round(change_at / loop.dt)
-    before = [loop.advance(turn)] if turn else []
+    turn, end = (round(time / loop.dt) for time in (change_at, seconds))
+    blocks = [loop.advance(turn)] if turn else []
     change(loop)
-    return Block.concatenate([*before, loop.advance(round(seconds / loop.dt) - turn)])
+    blocks += [loop.advance(end - turn)] if turn < end else []
+    return Block.concatenate(blocks)
 
 
 def _write(

@@ -110,7 +110,7 @@ def _ranking(answer: Answer) -> Markup:
     rest = f"The first {PLAIN} of {len(cars)} cars; the others need scripts, or fleet.json."
     return fragment(
         "fleet.html",
-        table=ranking_table(cars[:PLAIN]),
+        table=ranking_table(cars[:PLAIN], links=True),
         kinds=[reason for reason, count in answer["reasons"].items() if count],
         rest=rest if len(cars) > PLAIN else "",
         data=Markup(data),
@@ -237,12 +237,12 @@ def ranking_row(car: Answer) -> tuple[str, ...]:
     )
 
 
-def ranking_table(cars: Sequence[Answer]) -> Table:
-    """A row a car; its name leads to its report, where there is one."""
+def ranking_table(cars: Sequence[Answer], *, links: bool = False) -> Table:
+    """A row a car; with `links` its name leads to its report, where there is one."""
     rows = []
     for car in cars:
         name, *others = ranking_row(car)
-        link = report_of(car)
+        link = report_of(car) if links else ""
         rows.append((Markup('<a href="{}">{}</a>').format(link, printable(name)) if link else name, *others))
     return Table("Ranking of the cars", COLUMNS, tuple(rows), numeric=NUMERIC)
 
