@@ -35,7 +35,7 @@ def compare(
         arg.option("A simulator by its output: a file, or the prefix of columns of the log, such as sim."),
     ] = None,
     step: Annotated[
-        float | None, arg.option("The simulators' own step [s], if they take no other; default: the log's.")
+        float | None, arg.above_zero("The simulators' own step [s], if they take no other; default: the log's.", "s")
     ] = None,
     baseline: Annotated[
         str, arg.option("The simulator: effects such as dead_time=0.2, or TOML; glvd: fitted to the drives before.")
@@ -120,7 +120,7 @@ def compare(
     for table in () if talk.silent else comparison_tables(found):
         talk.table(table)
     if out is not None:
-        talk.done(out, found.to_dict(), [PAGE, "comparison.json"])
+        talk.done(out, found.to_dict())
     elif talk.json:
         talk.answer(found.to_dict())
 

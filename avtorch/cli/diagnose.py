@@ -65,7 +65,9 @@ def diagnose(
             TESTED,
         ),
     ] = None,
-    step: Annotated[float | None, arg.option("The simulator's own step [s]; default: the log's.", TESTED)] = None,
+    step: Annotated[
+        float | None, arg.above_zero("The simulator's own step [s]; default: the log's.", "s", group=TESTED)
+    ] = None,
     adjust: Annotated[
         list[str] | None,
         arg.option(

@@ -103,10 +103,8 @@ class Talk:
         if not webbrowser.open(page.absolute().as_uri()):
             self.line(f"No browser was found to open {page}")
 
-    def done(
-        self, out: Path, answer: Mapping[str, Any], names: Iterable[str] = (), *, files: Iterable[str] = ()
-    ) -> None:
-        """The answer as JSON, or where its files are: `names`, or all that a reader opens; a line each for `files`."""
+    def done(self, out: Path, answer: Mapping[str, Any], *, files: Iterable[str] = ()) -> None:
+        """The answer as JSON, or where its files are: all that a reader opens; or a line each for `files`."""
         if self.json:
             self.answer(answer)
             return
@@ -116,7 +114,7 @@ class Talk:
                 self.out.print(f"[bold]{escape(str(out / name))}[/bold]{says and '  '}{says}", soft_wrap=True)
             return
         kinds = (".html", ".json", ".png")
-        there = names or sorted(p.name for p in out.iterdir() if p.suffix in kinds and p.is_file())
+        there = sorted(p.name for p in out.iterdir() if p.suffix in kinds and p.is_file())
         self.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {escape(', '.join(there))}", soft_wrap=True)
 
 
