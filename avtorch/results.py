@@ -43,23 +43,23 @@ MEASURES = {
 """What is told of a drive, in words, by its key in `performance` of `run.json`."""
 
 
-def window_entry(watched: WatchedWindow, scenario: int = 0) -> dict[str, Any]:
-    """One window of `estimates.json` and `run.json`, for one scenario.
+def window_entry(watched: WatchedWindow) -> dict[str, Any]:
+    """One window of `estimates.json` and `run.json`, of a single vehicle.
 
     `excited` is the result of the fixed rule; `used` is also false where an excited window's chains did not settle, and
     the belief was carried over. The jerk form has `sigma` [m/s³], the latent form `noise` with its own parameters.
     """
     window, belief = watched.window, watched.window.belief
-    excited, converged = bool(belief.excited[scenario]), bool(belief.converged[scenario])
+    excited, converged = bool(belief.excited[0]), bool(belief.converged[0])
     return {
         "start_s": _seconds(window.start_s),
         "end_s": _seconds(window.end_s),
-        "n": int(window.n[scenario]),
+        "n": int(window.n[0]),
         "excited": excited,
         "used": excited and converged,
-        **_by_kind({name: belief.stat(name, scenario) for name in belief.names}),
-        "alerts": watched.report.names(scenario),
-        "p_string_stable": float(watched.report.p_string_stable[scenario]),
+        **_by_kind({name: belief.stat(name, 0) for name in belief.names}),
+        "alerts": watched.report.names(0),
+        "p_string_stable": float(watched.report.p_string_stable[0]),
     }
 
 
@@ -71,12 +71,12 @@ def _by_kind(stats: Mapping[str, Any]) -> dict[str, Any]:
     return {**actuation, "noise": {name: stat for name, stat in stats.items() if name not in actuation}}
 
 
-def alert_entries(watched: Sequence[WatchedWindow], scenario: int = 0) -> list[dict[str, Any]]:
+def alert_entries(watched: Sequence[WatchedWindow]) -> list[dict[str, Any]]:
     """The alerts of a drive, each at the end of the window that raised it: the moment it could be known."""
     return [
-        {"time_s": _seconds(w.window.end_s), "detector": name, "why": w.report.why(name, scenario)}
+        {"time_s": _seconds(w.window.end_s), "detector": name, "why": w.report.why(name, 0)}
         for w in watched
-        for name in w.report.names(scenario)
+        for name in w.report.names(0)
     ]
 
 
@@ -118,19 +118,18 @@ def run_answer(
     *,
     change: tuple[float, float, float],
     time_gap: float,
-    scenario: int = 0,
 ) -> dict[str, Any]:
-    """`run.json` of one scenario; `change` is (time [s], T_L [s], K_L) of the vehicle from then on.
+    """`run.json` of a single vehicle; `change` is (time [s], T_L [s], K_L) of the vehicle from then on.
 
     `without_action` is the same drive under the same noise and the setting it began with, of `time_gap` [s].
     """
-    actions = run.actions[scenario]
+    actions = run.actions[0]
     last_gap = float(actions[-1].setting.time_gap[0]) if actions else time_gap
     return {
         "schema": "avtorch.run/1",
         "change": dict(zip(("time_s", "T_L", "K_L"), change, strict=True)),
-        "windows": [window_entry(w, scenario) for w in run.windows],
-        "alerts": [{"time_s": _seconds(a.time_s), "detector": a.detector, "why": a.why} for a in run.alerts[scenario]],
+        "windows": [window_entry(w) for w in run.windows],
+        "alerts": [{"time_s": _seconds(a.time_s), "detector": a.detector, "why": a.why} for a in run.alerts[0]],
         "actions": [
             {
                 "time_s": _seconds(a.time_s),
@@ -145,8 +144,8 @@ def run_answer(
             for a in actions
         ],
         "performance": {
-            "without_action": _performance(without_action, time_gap, scenario),
-            "with_action": _performance(run.rows, last_gap, scenario),
+            "without_action": _performance(without_action, time_gap),
+            "with_action": _performance(run.rows, last_gap),
         },
     }
 
@@ -156,11 +155,11 @@ def _seconds(time: float) -> float:
     return round(time, 9)
 
 
-def _performance(rows: Block, time_gap: float, scenario: int) -> dict[str, Any]:
+def _performance(rows: Block, time_gap: float) -> dict[str, Any]:
     """The measures of a drive, and whether it ended in a collision, after which they mean little."""
     return {
-        **performance(rows, time_gap=time_gap).row(scenario),
-        "collided": bool(rows.collided[scenario]),
+        **performance(rows, time_gap=time_gap).row(0),
+        "collided": bool(rows.collided[0]),
     }
 
 

@@ -1,4 +1,4 @@
-"""Drawings: they take and return axes, show what they were given, and leave the reader's style alone."""
+"""Drawings show what they were given, and leave the reader's style alone."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ from avtorch.errors import InputError
 from avtorch.io import Log
 from avtorch.plots.plane import setting_region, verdict_map
 from avtorch.plots.style import AMPLIFIES, STABLE, UNSTABLE
-from avtorch.plots.time import belief_band, data_quality, events, motion, string_probability
-from avtorch.vehicle import stability
+from avtorch.plots.time import belief_band, data_quality, motion, string_probability
 
 
 def stat(mean: float, half: float) -> dict[str, float]:
@@ -58,26 +57,6 @@ def log() -> Log:
     speed = np.where(time < 1, 0.0, 5.0 + 0.1 * np.sin(time))
     engaged = (time < 7).astype(float)
     return Log.from_arrays(time=time, accel_cmd=np.sin(time), speed=speed, engaged=engaged)
-
-
-def test_every_drawing_returns_the_axes_it_was_given() -> None:
-    omega = torch.logspace(-1, 1, 50, dtype=torch.float64)
-    curve = stability.gain(omega, 1.5, 0.5, 1.0, (1.5, 1.5, -0.8))
-    plane = stability.region(("T", torch.linspace(0.1, 2, 21)), ("K", torch.linspace(0.2, 1.3, 11)))
-    draw = [
-        lambda ax: motion(ax, TIME, TRACES["speed"]),
-        lambda ax: belief_band(ax, WINDOWS, "T_L", truth=TRUTH["T_L"], bounds=(0.1, 0.4)),
-        lambda ax: string_probability(ax, WINDOWS),
-        lambda ax: events(ax, change_s=1.0, alerts=ANSWER["alerts"], actions=ANSWER["actions"]),
-        lambda ax: data_quality(ax, log(), WINDOWS),
-        lambda ax: plots.region(ax, plane, point=(0.3, 1.0)),
-        lambda ax: setting_region(ax, SETTING, T_range=(0.1, 2.0), K_range=(0.3, 1.3), points=11),
-        lambda ax: plots.gain_curve(ax, omega, curve, peak=(0.86, 2.24)),
-        lambda ax: plots.verdict_legend(ax),
-    ]
-    for step in draw:
-        ax = axes()
-        assert step(ax) is ax
 
 
 def test_band_shows_interval_and_breaks_where_not_excited() -> None:
@@ -209,15 +188,6 @@ def test_the_other_figures() -> None:
             box = legend.get_window_extent()
             assert box.x0 >= -1, "the legend runs out of the picture"
             assert box.x1 <= figure.bbox.x1 + 1, "the legend runs out of the picture"
-
-
-def test_an_alarm_that_goes_on_is_marked_once() -> None:
-    windows = [{**w, "alerts": ["stability"] if w["start_s"] >= 2.0 else []} for w in WINDOWS]
-    alerts = [{"time_s": w["end_s"], "detector": "stability", "why": "x"} for w in windows if w["alerts"]]
-    figure = plots.probability_figure(windows, answer={"windows": windows, "alerts": alerts})
-    marked = [line for line in figure.axes[0].lines if line.get_label() == "alert"]
-    assert [float(np.asarray(line.get_xdata())[0]) for line in marked] == [4.0]
-    assert sum(list(np.asarray(line.get_xdata())) == [6.0, 6.0] for line in figure.axes[0].lines) == 0
 
 
 def test_style_of_the_reader_is_left_alone() -> None:

@@ -45,6 +45,30 @@ def local_folder(_: Any, tokens: Sequence[Token]) -> Path:
     return Path(text)
 
 
+def option(help: str, group: Group | None = None, **more: Any) -> Parameter:
+    """Of a value, a list, or something to switch on, which has no negative."""
+    # None would be a group, too: one that help leaves out
+    return Parameter(help=help, negative=(), **(more if group is None else {"group": group, **more}))
+
+
+def whole(help: str, *, least: int | None = None, **more: Any) -> Parameter:
+    """Of a whole number."""
+    check = None if least is None else _checked(lambda x: x >= least, f"{least} or more")
+    return option(help, converter=whole_number, validator=check, **more)
+
+
+def above_zero(help: str, unit: str = "", **more: Any) -> Parameter:
+    """Of a finite number above zero."""
+    needs = f"a finite number above 0 {unit}".rstrip()
+    return option(help, validator=_checked(lambda x: math.isfinite(x) and x > 0, needs), **more)
+
+
+def zero_or_more(help: str, unit: str = "", **more: Any) -> Parameter:
+    """Of a finite number that is not below zero."""
+    needs = f"a finite number of 0 {unit} or more".replace("  ", " ")
+    return option(help, validator=_checked(lambda x: math.isfinite(x) and x >= 0, needs), **more)
+
+
 def _checked(fits: Callable[[Any], bool], needs: str) -> Callable[[Any, Any], None]:
     """The check of an option that is given: what `fits` it, and what it `needs` in words."""
 
@@ -56,80 +80,42 @@ def _checked(fits: Callable[[Any], bool], needs: str) -> Callable[[Any, Any], No
     return check
 
 
-def above_zero(unit: str = "") -> Callable[[Any, Any], None]:
-    return _checked(lambda x: math.isfinite(x) and x > 0, f"a finite number above 0 {unit}".rstrip())
-
-
-def zero_or_more(unit: str = "") -> Callable[[Any, Any], None]:
-    return _checked(lambda x: math.isfinite(x) and x >= 0, f"a finite number of 0 {unit} or more".replace("  ", " "))
-
-
-def at_least(least: int) -> Callable[[Any, Any], None]:
-    return _checked(lambda x: x >= least, f"{least} or more")
-
-
 _is_seed = _checked(lambda x: 0 <= x < 2**63, "a whole number from 0 to 2^63 - 1")
 
-
-Out = Annotated[
-    Path,
-    Parameter(name="--out", group=OUTPUT, converter=local_folder, help="Folder for the answer and the pictures."),
-]
-Columns = Annotated[
-    list[str] | None,
-    Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
-]
-Units = Annotated[
-    list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable.")
-]
-Stamps = Annotated[
-    list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
-]
-Open = Annotated[bool, Parameter(name="--open", negative=(), group=OUTPUT, help="Show the page in your browser.")]
-Verbose = Annotated[
-    bool, Parameter(name=("--verbose", "-v"), negative=(), group=OUTPUT, help="Print all that was found.")
-]
-Json = Annotated[bool, Parameter(name="--json", negative=(), group=OUTPUT, help="Print the answer as JSON, no tables.")]
-Quiet = Annotated[bool, Parameter(name=("--quiet", "-q"), negative=(), group=OUTPUT, help="Print nothing but errors.")]
-Seed = Annotated[
-    int, Parameter(name="--seed", converter=whole_number, validator=_is_seed, help="Seed of everything random.")
-]
-Gains = Annotated[str, Parameter(name="--gains", help="Gains k_s,k_v,k_a of the upper level.")]
-Lag = Annotated[float, Parameter(name="--T", validator=above_zero("s"), help="Actuation lag T_L [s].")]
-Gain = Annotated[float, Parameter(name="--K", validator=above_zero(), help="Actuation gain K_L [-].")]
-TimeGap = Annotated[float, Parameter(name="--tau", validator=above_zero("s"), help="Time gap [s].")]
-Window = Annotated[float, Parameter(validator=above_zero("s"), help="Length of a window [s].")]
-Accepted = Annotated[
-    str, Parameter(help="T_L,K_L of the car as it should be, which accepted_change compares with [s, -].")
-]
+Out = Annotated[Path, option("Folder for the answer and its files.", OUTPUT, name="--out", converter=local_folder)]
+Columns = Annotated[list[str] | None, option("Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable.")]
+Units = Annotated[list[str] | None, option("Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable.")]
+Stamps = Annotated[list[str] | None, option("Own time column of a signal, SIGNAL=COLUMN; repeatable.")]
+Open = Annotated[bool, option("Show the page in your browser.", OUTPUT, name="--open")]
+Verbose = Annotated[bool, option("Print all that was found.", OUTPUT, name=("--verbose", "-v"))]
+Json = Annotated[bool, option("Print the answer as JSON, no tables.", OUTPUT, name="--json")]
+Quiet = Annotated[bool, option("Print nothing but errors.", OUTPUT, name=("--quiet", "-q"))]
+Seed = Annotated[int, option("Seed of everything random.", name="--seed", converter=whole_number, validator=_is_seed)]
+Gains = Annotated[str, option("Gains k_s,k_v,k_a of the upper level.", name="--gains")]
+Lag = Annotated[float, above_zero("Actuation lag T_L [s].", "s", name="--T")]
+Gain = Annotated[float, above_zero("Actuation gain K_L [-].", name="--K")]
+TimeGap = Annotated[float, above_zero("Time gap [s].", "s", name="--tau")]
+Window = Annotated[float, above_zero("Length of a window [s].", "s")]
+Accepted = Annotated[str, option("T_L,K_L of the car as it should be, which accepted_change compares with [s, -].")]
 DeadTime = Annotated[
     float | None,
-    Parameter(
-        validator=zero_or_more("s"),
-        help="Dead time of the car [s], if known; by default inferred where jerk is not measured.",
-    ),
+    zero_or_more("Dead time of the car [s], if known; by default inferred where jerk is not measured.", "s"),
 ]
 Form = Annotated[
-    Literal["auto", "jerk", "latent"],
-    Parameter(help="Likelihood: of measured jerk, or of noisy acceleration and speed."),
+    Literal["auto", "jerk", "latent"], option("Likelihood: of measured jerk, or of noisy acceleration and speed.")
 ]
 Estimator = Annotated[
     Literal["auto", "sgld", "importance", "map", "rls", "ekf", "ukf"],
-    Parameter(
-        help="SGLD, importance sampling, posterior mode, recursive least squares, extended or unscented Kalman "
+    option(
+        "SGLD, importance sampling, posterior mode, recursive least squares, extended or unscented Kalman "
         "filter; auto: SGLD where jerk is measured, else importance sampling."
     ),
 ]
-Mode = Annotated[
-    Literal["lambda", "posterior", "forgetting"], Parameter(help="How a posterior becomes the next prior.")
-]
-Baseline = Annotated[str, Parameter(help="Your simulator: glvd, effects such as dead_time=0.2, or a TOML file.")]
-Effects = Annotated[str | None, Parameter(help="Only these effects, NAME,NAME,...; default: all.")]
+Mode = Annotated[Literal["lambda", "posterior", "forgetting"], option("How a posterior becomes the next prior.")]
+Baseline = Annotated[str, option("Your simulator: glvd, effects such as dead_time=0.2, or a TOML file.")]
+Effects = Annotated[str | None, option("Only these effects, NAME,NAME,...; default: all.")]
 Pairs = Annotated[bool, Parameter(help="Look for several effects at once.")]
-Budget = Annotated[
-    float | None,
-    Parameter(validator=above_zero("s"), help="Stop the search of a diagnosis after this time [s]; default: none."),
-]
+Budget = Annotated[float | None, above_zero("Stop the search of a diagnosis after this time [s]; default: none.", "s")]
 
 
 def _numbers(name: str, text: str, count: int, needs: str, fits: Callable[[list[float]], bool]) -> list[float]:

@@ -6,8 +6,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import Parameter
-
 from avtorch.cli import arguments as arg
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError
@@ -21,9 +19,7 @@ def check(
     *,
     map: arg.Columns = None,
     unit: arg.Units = None,
-    yes: Annotated[
-        bool, Parameter(name=("--yes", "-y"), negative=(), group=arg.OUTPUT, help="Write the proposed mapping unasked.")
-    ] = False,
+    yes: Annotated[bool, arg.option("Write the proposed mapping unasked.", arg.OUTPUT, name=("--yes", "-y"))] = False,
     json: arg.Json = False,
     quiet: arg.Quiet = False,
 ) -> None:

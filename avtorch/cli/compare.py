@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import Parameter
-
 from avtorch.cli import arguments as arg
 from avtorch.cli.simulators import read_simulator, simulator_of, simulators_of
 from avtorch.cli.talk import Talk, write_answer
@@ -26,36 +24,26 @@ def compare(
     /,
     *,
     after: Annotated[
-        list[Path] | None,
-        Parameter(negative=(), consume_multiple=True, help="The drives after the change; all of LOGS are before it."),
+        list[Path] | None, arg.option("The drives after the change; all of LOGS are before it.", consume_multiple=True)
     ] = None,
     simulator: Annotated[
         list[str] | None,
-        Parameter(
-            negative=(),
-            help="A simulator: MODULE:NAME, FILE.py:NAME or an FMU; effects such as dead_time=0.2, or TOML.",
-        ),
+        arg.option("A simulator: MODULE:NAME, FILE.py:NAME or an FMU; effects such as dead_time=0.2, or TOML."),
     ] = None,
     simulated: Annotated[
         list[str] | None,
-        Parameter(
-            negative=(), help="A simulator by its output: a file, or the prefix of columns of the log, such as sim."
-        ),
+        arg.option("A simulator by its output: a file, or the prefix of columns of the log, such as sim."),
     ] = None,
     step: Annotated[
-        float | None, Parameter(help="The simulators' own step [s], if they take no other; default: the log's.")
+        float | None, arg.above_zero("The simulators' own step [s], if they take no other; default: the log's.", "s")
     ] = None,
     baseline: Annotated[
-        str, Parameter(help="The simulator: effects such as dead_time=0.2, or TOML; glvd: fitted to the drives before.")
+        str, arg.option("The simulator: effects such as dead_time=0.2, or TOML; glvd: fitted to the drives before.")
     ] = "glvd",
-    baseline_after: Annotated[
-        str | None, Parameter(help="The simulator of the drives after; default: the same.")
-    ] = None,
+    baseline_after: Annotated[str | None, arg.option("The simulator of the drives after; default: the same.")] = None,
     out: Annotated[
         Path | None,
-        Parameter(
-            name="--out", group=arg.OUTPUT, converter=arg.local_folder, help="Folder for comparison.html and .json."
-        ),
+        arg.option("Folder for comparison.html and .json.", arg.OUTPUT, name="--out", converter=arg.local_folder),
     ] = None,
     map: arg.Columns = None,
     unit: arg.Units = None,
@@ -132,7 +120,7 @@ def compare(
     for table in () if talk.silent else comparison_tables(found):
         talk.table(table)
     if out is not None:
-        talk.done(out, found.to_dict(), [PAGE, "comparison.json"])
+        talk.done(out, found.to_dict())
     elif talk.json:
         talk.answer(found.to_dict())
 

@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from cyclopts import Group, Parameter
+from cyclopts import Group
 
 from avtorch.cli import arguments as arg
 from avtorch.cli.pedals import FILES as PEDAL_FILES
@@ -51,96 +51,79 @@ def diagnose(
     baseline: arg.Baseline = "glvd",
     simulated: Annotated[
         list[str] | None,
-        Parameter(
-            group=TESTED,
-            negative=(),
-            help="Its output under the same commands, one file for each log; or the prefix of the log's own columns "
-            "that hold it, such as sim. for sim.speed; repeatable.",
+        arg.option(
+            "Its output under the same commands, one file for each log; or the prefix of the log's "
+            "own columns that hold it, such as sim. for sim.speed; repeatable.",
+            TESTED,
         ),
     ] = None,
     simulator: Annotated[
         str | None,
-        Parameter(
-            group=TESTED,
-            help="The simulator itself: an FMU, or MODULE:NAME or FILE.py:NAME with reset(speed, accel) and "
-            "step(accel_cmd, dt).",
+        arg.option(
+            "The simulator itself: an FMU, or MODULE:NAME or FILE.py:NAME with reset(speed, accel) "
+            "and step(accel_cmd, dt).",
+            TESTED,
         ),
     ] = None,
     step: Annotated[
-        float | None, Parameter(group=TESTED, help="The simulator's own step [s]; default: the log's.")
+        float | None, arg.above_zero("The simulator's own step [s]; default: the log's.", "s", group=TESTED)
     ] = None,
     adjust: Annotated[
         list[str] | None,
-        Parameter(
-            group=TESTED,
-            negative=(),
-            help="A parameter of the simulator that may be wrong, NAME=LOW:HIGH, such as lag=0.1:1.0; repeatable.",
+        arg.option(
+            "A parameter of the simulator that may be wrong, NAME=LOW:HIGH, such as lag=0.1:1.0; repeatable.", TESTED
         ),
     ] = None,
     rollouts: Annotated[
-        int | None,
-        Parameter(group=TESTED, help="How often the simulator may be driven along the logs for that; default: 50."),
+        int | None, arg.option("How often the simulator may be driven along the logs for that; default: 50.", TESTED)
     ] = None,
-    processes: Annotated[
-        int, Parameter(group=TESTED, help="How many of these drives at once, for a slow simulator.")
-    ] = 1,
+    processes: Annotated[int, arg.option("How many of these drives at once, for a slow simulator.", TESTED)] = 1,
     prior: Annotated[
         list[str] | None,
-        Parameter(
-            negative=(), help="Prior weight of a hypothesis, NAME=WEIGHT (effect, none, unknown, pair); repeatable."
-        ),
+        arg.option("Prior weight of a hypothesis, NAME=WEIGHT (effect, none, unknown, pair); repeatable."),
     ] = None,
     accel_kind: Annotated[
         Literal["kinematic", "specific-force"],
-        Parameter(help="What accel is: dv/dt, or an accelerometer's reading of specific force."),
+        arg.option("What accel is: dv/dt, or an accelerometer's reading of specific force."),
     ] = "kinematic",
     budget: arg.Budget = None,
-    material: Annotated[float, Parameter(help="Share of the gap from which something counts, between 0 and 1.")] = 0.03,
+    material: Annotated[float, arg.option("Share of the gap from which something counts, between 0 and 1.")] = 0.03,
     effects: arg.Effects = None,
     pairs: arg.Pairs = True,
     named_only: Annotated[
-        bool, Parameter(negative=(), help="The repaired simulator has named effects alone, no map without a name.")
+        bool, arg.option("The repaired simulator has named effects alone, no map without a name.")
     ] = False,
     posterior: Annotated[
-        Literal["laplace", "sgld"],
-        Parameter(help="Posterior of the winner's parameters: normal approximation, or SGLD."),
+        Literal["laplace", "sgld"], arg.option("Posterior of the winner's parameters: normal approximation, or SGLD.")
     ] = "sgld",
     estimates: Annotated[
         list[Path] | None,
-        Parameter(
-            negative=(),
-            help="estimates.json of avtorch estimate on the same log, whose alarms the report marks; one for each log.",
+        arg.option(
+            "estimates.json of avtorch estimate on the same log, whose alarms the report marks; one for each log."
         ),
     ] = None,
     credibility: Annotated[
-        bool,
-        Parameter(
-            negative=(), group=arg.OUTPUT, help="Also write credibility.html and .md, the evidence for an assessor."
-        ),
+        bool, arg.option("Also write credibility.html and .md, the evidence for an assessor.", arg.OUTPUT)
     ] = False,
-    follower: Annotated[
-        bool, Parameter(group=FOLLOWER, negative=(), help="The log is of a car that follows, and has no accel_cmd.")
-    ] = False,
-    vehicle: Annotated[int | None, Parameter(group=FOLLOWER, help="Which vehicle of an OpenACC platoon.")] = None,
+    follower: Annotated[bool, arg.option("The log is of a car that follows, and has no accel_cmd.", FOLLOWER)] = False,
+    vehicle: Annotated[int | None, arg.option("Which vehicle of an OpenACC platoon.", FOLLOWER)] = None,
     law: Annotated[
         Literal["constant_time_gap", "intelligent_driver"] | None,
-        Parameter(group=FOLLOWER, help="The assumed controller; default: the one that predicts better."),
+        arg.option("The assumed controller; default: the one that predicts better.", FOLLOWER),
     ] = None,
-    event: Annotated[int | None, Parameter(group=FOLLOWER, help="Which event of an NGSIM file.")] = None,
+    event: Annotated[int | None, arg.option("Which event of an NGSIM file.", FOLLOWER)] = None,
     speed_min: Annotated[
-        float | None, Parameter(group=TRACK, help="Lowest speed of the next experiment [m/s]; default: as in the log.")
+        float | None, arg.option("Lowest speed of the next experiment [m/s]; default: as in the log.", TRACK)
     ] = None,
-    speed_max: Annotated[
-        float | None, Parameter(group=TRACK, help="Highest speed [m/s]; default: as in the log.")
-    ] = None,
+    speed_max: Annotated[float | None, arg.option("Highest speed [m/s]; default: as in the log.", TRACK)] = None,
     accel_min: Annotated[
-        float | None, Parameter(group=TRACK, help="Hardest braking [m/s²], below 0; default: as in the log.")
+        float | None, arg.option("Hardest braking [m/s²], below 0; default: as in the log.", TRACK)
     ] = None,
     accel_max: Annotated[
-        float | None, Parameter(group=TRACK, help="Hardest acceleration [m/s²]; default: as in the log.")
+        float | None, arg.option("Hardest acceleration [m/s²]; default: as in the log.", TRACK)
     ] = None,
-    road: Annotated[float | None, Parameter(group=TRACK, help="Length of the road [m]; default: 2000.")] = None,
-    seconds: Annotated[float | None, Parameter(group=TRACK, help="Duration [s]; default: 60.")] = None,
+    road: Annotated[float | None, arg.option("Length of the road [m]; default: 2000.", TRACK)] = None,
+    seconds: Annotated[float | None, arg.option("Duration [s]; default: 60.", TRACK)] = None,
     seed: arg.Seed = 0,
     open_page: arg.Open = False,
     verbose: arg.Verbose = False,

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TextIO
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -15,15 +13,10 @@ from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
-if TYPE_CHECKING:
-    from avtorch.decision.watch import WatchedWindow
-
 PAGE = "estimates.html"
 STATE = "windows.state"
 """Finished windows, and the belief behind them. The estimate keeps them and compares what they belong to with its
 settings."""
-LINES = "windows.jsonl"
-"""One line a window, each an entry of `windows` in `estimates.json`, which takes its place in the end."""
 PASSING_ON = ("auto", "sgld", "importance", "map")
 """Estimators whose posteriors become priors, so that `--mode` has a meaning."""
 
@@ -89,8 +82,8 @@ def estimate(
     options |= {"form": form, "setting": setting, "dead_time": dead_time, "seed": seed, "accepted": sound}
     options |= {"estimator": estimator, "align": align, "checkpoint": out / STATE}
     try:
-        with talk.progress("Estimating") as step, finished_windows(out) as written:
-            found = work(drive, window, progress=step, finished=written, **options)
+        with talk.progress("Estimating") as step:
+            found = work(drive, window, progress=step, **options)
     except KeyboardInterrupt:
         if (out / STATE).exists():
             message = (
@@ -140,31 +133,3 @@ def _begin_anew(path: Path) -> None:
         path.unlink(missing_ok=True)
     except OSError as fault:
         raise InputError(f"--no-resume: {path} cannot be removed ({fault.strerror}); needs another folder") from None
-
-
-@contextmanager
-def finished_windows(out: Path) -> Iterator[Callable[[WatchedWindow], None]]:
-    """A function that writes a window to `LINES` in `out`; the file is removed where no exception is raised.
-
-    After an interruption it holds the windows finished by then. Raises `InputError` where it cannot be written.
-    """
-    from avtorch.io.answers import json_text
-    from avtorch.results import window_entry
-
-    path = out / LINES
-    with ExitStack() as opened:
-        streams: list[TextIO] = []
-
-        def write(window: WatchedWindow) -> None:
-            try:
-                if not streams:  # not before there is something to write: a refused log leaves no folder
-                    out.mkdir(parents=True, exist_ok=True)
-                    streams.append(opened.enter_context(path.open("w", encoding="utf-8")))
-                streams[0].write(json_text(window_entry(window), indent=None).strip() + "\n")
-                streams[0].flush()
-            except OSError as fault:
-                raise InputError(f"{path}: cannot be written ({fault.strerror}); windows go there when done") from None
-
-        yield write
-    if streams:
-        path.unlink(missing_ok=True)

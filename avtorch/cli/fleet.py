@@ -6,7 +6,7 @@ import os
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
-from cyclopts import Group, Parameter
+from cyclopts import Group
 
 from avtorch.cli import arguments as arg
 from avtorch.cli.diagnose import chosen_effects
@@ -29,7 +29,7 @@ def fleet(
     *,
     out: arg.Out,
     only: Annotated[
-        str | None, Parameter(help="Only these steps, STEP,STEP of check, estimate and diagnose; default: all.")
+        str | None, arg.option("Only these steps, STEP,STEP of check, estimate and diagnose; default: all.")
     ] = None,
     map: arg.Columns = None,
     unit: arg.Units = None,
@@ -40,27 +40,20 @@ def fleet(
     gains: arg.Gains = "1.5,1.5,-0.8",
     accepted: arg.Accepted = "0.3,1.0",
     dead_time: arg.DeadTime = None,
-    target: Annotated[float, Parameter(help="A car with a lower P(string stable) comes first.")] = 0.9,
+    target: Annotated[float, arg.option("A car with a lower P(string stable) comes first.")] = 0.9,
     baseline: arg.Baseline = "glvd",
     effects: arg.Effects = None,
     pairs: arg.Pairs = True,
     budget: arg.Budget = None,
-    reports: Annotated[
-        bool, Parameter(negative=(), group=arg.OUTPUT, help="Write the report of each diagnosed log, and link to it.")
-    ] = False,
-    retry: Annotated[bool, Parameter(negative=(), help="Try logs again that failed in an earlier run.")] = False,
+    reports: Annotated[bool, arg.option("Write the report of each diagnosed log, and link to it.", arg.OUTPUT)] = False,
+    retry: Annotated[bool, arg.option("Try logs again that failed in an earlier run.")] = False,
     workers: Annotated[
         int | None,
-        Parameter(
-            group=CLUSTER,
-            validator=arg.at_least(1),
-            help="Processes on this machine, one thread each; default: one a core.",
-        ),
+        arg.whole("Processes on this machine, one thread each; default: one a core.", least=1, group=CLUSTER),
     ] = None,
-    memory: Annotated[str, Parameter(group=CLUSTER, help="Most memory of each of them.")] = "2GiB",
+    memory: Annotated[str, arg.option("Most memory of each of them.", CLUSTER)] = "2GiB",
     scheduler: Annotated[
-        str | None,
-        Parameter(group=CLUSTER, help="Address of a running Dask scheduler, such as tcp://10.0.0.1:8786."),
+        str | None, arg.option("Address of a running Dask scheduler, such as tcp://10.0.0.1:8786.", CLUSTER)
     ] = None,
     seed: arg.Seed = 0,
     open_page: arg.Open = False,

@@ -8,8 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from cyclopts import Parameter
-
 from avtorch.cli import arguments as arg
 from avtorch.cli.talk import Talk, write_answer
 
@@ -25,12 +23,9 @@ def paper(
     out: arg.Out,
     data: Annotated[
         Path | None,
-        Parameter(help="Folder that holds ngsim and the OpenACC platoons; default: AVTORCH_DATA, or US06 without one."),
+        arg.option("Folder that holds ngsim and the OpenACC platoons; default: AVTORCH_DATA, or US06 without one."),
     ] = None,
-    seeds: Annotated[
-        int,
-        Parameter(converter=arg.whole_number, validator=arg.at_least(2), help="Noise seeds of every setting."),
-    ] = 20,
+    seeds: Annotated[int, arg.whole("Noise seeds of every setting.", least=2)] = 20,
     seed: arg.Seed = 0,
     json: arg.Json = False,
     quiet: arg.Quiet = False,

@@ -7,8 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from cyclopts import Parameter
-
 from avtorch.cli import arguments as arg
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
@@ -28,32 +26,23 @@ PAGE = "run.html"
 
 def run(
     *,
-    leader: Annotated[Path | None, Parameter(help="Recorded leader (OpenACC, NGSIM, I-24, CSV); default US06.")] = None,
-    vehicle: Annotated[
-        int | None, Parameter(converter=arg.whole_number, help="Which vehicle of the leader's file.")
-    ] = None,
-    event: Annotated[
-        int | None, Parameter(converter=arg.whole_number, help="Which event of the leader's file (NGSIM).")
-    ] = None,
+    leader: Annotated[Path | None, arg.option("Recorded leader (OpenACC, NGSIM, I-24, CSV); default US06.")] = None,
+    vehicle: Annotated[int | None, arg.whole("Which vehicle of the leader's file.")] = None,
+    event: Annotated[int | None, arg.whole("Which event of the leader's file (NGSIM).")] = None,
     duration: Annotated[
-        float | None,
-        Parameter(validator=arg.above_zero("s"), help="Length of the run [s]; default 80, or the leader's."),
+        float | None, arg.above_zero("Length of the run [s]; default 80, or the leader's.", "s")
     ] = None,
     window: arg.Window = 2.0,
-    change_at: Annotated[
-        float, Parameter(validator=arg.zero_or_more("s"), help="When the vehicle changes [s].")
-    ] = 26.0,
-    T: Annotated[arg.Lag, Parameter(help="Actuation lag T_L from the change on [s].")] = 1.5,
-    K: Annotated[arg.Gain, Parameter(help="Actuation gain K_L from the change on [-].")] = 0.5,
+    change_at: Annotated[float, arg.zero_or_more("When the vehicle changes [s].", "s")] = 26.0,
+    T: Annotated[arg.Lag, arg.option("Actuation lag T_L from the change on [s].")] = 1.5,
+    K: Annotated[arg.Gain, arg.option("Actuation gain K_L from the change on [-].")] = 0.5,
     strategy: Annotated[
         Literal["auto", "1", "2", "3", "none"],
-        Parameter(
-            help="What may change: 1 lower level, 2 time gap as well, 3 gains as well, auto any, none only watch."
-        ),
+        arg.option("What may change: 1 lower level, 2 time gap as well, 3 gains as well, auto any, none only watch."),
     ] = "auto",
-    controller: Annotated[Literal["linear", "mpc"], Parameter(help="Upper level.")] = "linear",
-    noise: Annotated[float, Parameter(validator=arg.zero_or_more("m/s³"), help="Jerk noise [m/s³].")] = 0.1,
-    limits: Annotated[str, Parameter(help="Least and greatest command MIN,MAX [m/s²].")] = "-6,4",
+    controller: Annotated[Literal["linear", "mpc"], arg.option("Upper level.")] = "linear",
+    noise: Annotated[float, arg.zero_or_more("Jerk noise [m/s³].", "m/s³")] = 0.1,
+    limits: Annotated[str, arg.option("Least and greatest command MIN,MAX [m/s²].")] = "-6,4",
     seed: arg.Seed = 0,
     out: arg.Out,
     open_page: arg.Open = False,
@@ -137,10 +126,11 @@ def _unwatched(loop: ClosedLoop, seconds: float, change_at: float, change: Calla
     """The same drive without a monitor."""
     from avtorch.vehicle import Block
 
-    turn = round(change_at / loop.dt)
-    before = [loop.advance(turn)] if turn else []
+    turn, end = (round(time / loop.dt) for time in (change_at, seconds))
+    blocks = [loop.advance(turn)] if turn else []
     change(loop)
-    return Block.concatenate([*before, loop.advance(round(seconds / loop.dt) - turn)])
+    blocks += [loop.advance(end - turn)] if turn < end else []
+    return Block.concatenate(blocks)
 
 
 def _write(

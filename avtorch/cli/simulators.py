@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import Group, Parameter
+from cyclopts import Group
 from rich.markup import escape
 
 from avtorch.cli import arguments as arg
@@ -80,8 +79,6 @@ def simulator_of(
     from avtorch.io.mapping import mapping_beside
 
     if simulator is not None:
-        if step is not None and not 0 < step < math.inf:
-            raise InputError(f"--step: found {step:g}, needs a step above 0 s")
         if rollouts is not None and not adjust:
             raise InputError("--rollouts: has a meaning with --adjust only")
         limits = _limits(adjust)
@@ -182,11 +179,11 @@ def check_simulator(
     simulator: str,
     /,
     *,
-    T: Annotated[float | None, Parameter(name="--T", group=BELIEVED, help="Lag [s].")] = None,
-    K: Annotated[float | None, Parameter(name="--K", group=BELIEVED, help="Gain.")] = None,
-    delay: Annotated[float | None, Parameter(group=BELIEVED, help="Dead time [s].")] = None,
-    step: Annotated[float, Parameter(help="Step of the manoeuvres [s].")] = 0.02,
-    mapping: Annotated[Path | None, Parameter(help="TOML file with an FMU's variables.")] = None,
+    T: Annotated[float | None, arg.zero_or_more("Lag [s].", "s", group=BELIEVED, name="--T")] = None,
+    K: Annotated[float | None, arg.zero_or_more("Gain.", group=BELIEVED, name="--K")] = None,
+    delay: Annotated[float | None, arg.zero_or_more("Dead time [s].", "s", group=BELIEVED)] = None,
+    step: Annotated[float, arg.option("Step of the manoeuvres [s].")] = 0.02,
+    mapping: Annotated[Path | None, arg.option("TOML file with an FMU's variables.")] = None,
     json: arg.Json = False,
     quiet: arg.Quiet = False,
 ) -> None:
@@ -197,9 +194,6 @@ def check_simulator(
     simulator
         MODULE:NAME or FILE.py:NAME of an object with reset(speed, accel) and step(accel_cmd, dt), or an FMU.
     """
-    for option, value in (("--T", T), ("--K", K), ("--delay", delay)):
-        if value is not None and not 0 <= value < 100:
-            raise InputError(f"{option}: found {value:g}, needs a number from 0 to 100")
     from avtorch.external import check_simulator as work
     from avtorch.external import load_simulator
     from avtorch.gap.simulator.effect import delay_key

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import Parameter
-
 from avtorch.cli import arguments as arg
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError, quoted
@@ -27,10 +25,10 @@ def stability(
     *,
     T: arg.Lag = 0.3,
     K: arg.Gain = 1.0,
-    tau: Annotated[float, Parameter(validator=arg.zero_or_more("s"), help="Time gap [s].")] = 1.0,
+    tau: Annotated[float, arg.zero_or_more("Time gap [s].", "s")] = 1.0,
     gains: arg.Gains = "1.5,1.5,-0.8",
-    dead_time: Annotated[float, Parameter(validator=arg.zero_or_more("s"), help="Dead time in the chain [s].")] = 0.0,
-    plane: Annotated[str, Parameter(help=f"Axes of the region: two out of {', '.join(_AXES)}.")] = "T,K",
+    dead_time: Annotated[float, arg.zero_or_more("Dead time in the chain [s].", "s")] = 0.0,
+    plane: Annotated[str, arg.option(f"Axes of the region: two out of {', '.join(_AXES)}.")] = "T,K",
     out: arg.Out = Path("out/stability"),
     json: arg.Json = False,
     quiet: arg.Quiet = False,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.segment import Segment
+from rich.status import Status
 from rich.table import Table as Drawn
 
 from avtorch.errors import printable
@@ -63,14 +64,9 @@ class Talk:
         finally:
             bar.close()
 
-    @contextmanager
-    def waiting(self, what: str) -> Iterator[None]:
-        """A sign of life on a terminal."""
-        if self.err.is_terminal:
-            with self.err.status(what):
-                yield
-        else:
-            yield
+    def waiting(self, what: str) -> Status:
+        """A sign of life on a terminal, for as long as its `with` lasts."""
+        return self.err.status(what)
 
     def notes(self, title: str, notes: Sequence[str]) -> None:
         """A title and lines below it."""
@@ -107,10 +103,8 @@ class Talk:
         if not webbrowser.open(page.absolute().as_uri()):
             self.line(f"No browser was found to open {page}")
 
-    def done(
-        self, out: Path, answer: Mapping[str, Any], names: Iterable[str] = (), *, files: Iterable[str] = ()
-    ) -> None:
-        """The answer as JSON, or where its files are: `names`, or all that a reader opens; a line each for `files`."""
+    def done(self, out: Path, answer: Mapping[str, Any], *, files: Iterable[str] = ()) -> None:
+        """The answer as JSON, or where its files are: all that a reader opens; or a line each for `files`."""
         if self.json:
             self.answer(answer)
             return
@@ -120,7 +114,7 @@ class Talk:
                 self.out.print(f"[bold]{escape(str(out / name))}[/bold]{says and '  '}{says}", soft_wrap=True)
             return
         kinds = (".html", ".json", ".png")
-        there = names or sorted(p.name for p in out.iterdir() if p.suffix in kinds and p.is_file())
+        there = sorted(p.name for p in out.iterdir() if p.suffix in kinds and p.is_file())
         self.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {escape(', '.join(there))}", soft_wrap=True)
 
 

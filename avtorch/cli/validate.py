@@ -7,8 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import Parameter
-
 from avtorch.cli import arguments as arg
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
@@ -28,36 +26,18 @@ SYNTHETIC = 200
 def validate(
     log: Path | None = None,
     *,
-    synthetic: Annotated[
-        bool, Parameter(negative=(), help="Windows of simulated vehicles, slow to quick, in place of a log.")
-    ] = False,
+    synthetic: Annotated[bool, arg.option("Windows of simulated vehicles, slow to quick, in place of a log.")] = False,
     windows: Annotated[
-        int | None,
-        Parameter(
-            converter=arg.whole_number,
-            validator=arg.at_least(1),
-            help="Number of windows; 200 synthetic ones, or all of a log.",
-        ),
+        int | None, arg.whole("Number of windows; 200 synthetic ones, or all of a log.", least=1)
     ] = None,
     window: arg.Window = 2.0,
     out: arg.Out,
     nuts_windows: Annotated[
-        int | None,
-        Parameter(
-            converter=arg.whole_number,
-            validator=arg.at_least(1),
-            help="Number of windows that NUTS samples; 3, or 1 without jerk (minutes each).",
-        ),
+        int | None, arg.whole("Number of windows that NUTS samples; 3, or 1 without jerk (minutes each).", least=1)
     ] = None,
-    spread: Annotated[
-        float,
-        Parameter(validator=arg.zero_or_more(), help="Posterior SDs around the mode at which chains start."),
-    ] = 0.0,
-    chains: Annotated[
-        int | None,
-        Parameter(converter=arg.whole_number, validator=arg.at_least(1), help="SGLD chains per window."),
-    ] = None,
-    draws: Annotated[int | None, Parameter(converter=arg.whole_number, help="Draws kept of each chain.")] = None,
+    spread: Annotated[float, arg.zero_or_more("Posterior SDs around the mode at which chains start.")] = 0.0,
+    chains: Annotated[int | None, arg.whole("SGLD chains per window.", least=1)] = None,
+    draws: Annotated[int | None, arg.whole("Draws kept of each chain.")] = None,
     map: arg.Columns = None,
     unit: arg.Units = None,
     stamp: arg.Stamps = None,

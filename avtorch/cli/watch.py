@@ -28,40 +28,27 @@ def watch(
     source: Annotated[str, Parameter(allow_leading_hyphen=True)],
     /,
     *,
-    follow: Annotated[
-        bool, Parameter(negative=(), group=SOURCE, help="Go on with what is written to the file later.")
-    ] = False,
+    follow: Annotated[bool, arg.option("Go on with what is written to the file later.", SOURCE)] = False,
     rate: Annotated[
         float | None,
-        Parameter(
-            group=SOURCE,
-            validator=arg.above_zero(),
-            help="Play a recording this many times faster than recorded; default: at once.",
-        ),
+        arg.above_zero("Play a recording this many times faster than recorded; default: at once.", group=SOURCE),
     ] = None,
     car: Annotated[
-        str | None, Parameter(group=SOURCE, help="Name of the car where rows have none; default: car, or the file's.")
+        str | None, arg.option("Name of the car where rows have none; default: car, or the file's.", SOURCE)
     ] = None,
     map: arg.Columns = None,
     unit: arg.Units = None,
     lateness: Annotated[
-        float,
-        Parameter(
-            group=SOURCE,
-            validator=arg.zero_or_more("s"),
-            help="How far a row may come behind newer ones and still count [s].",
-        ),
+        float, arg.zero_or_more("How far a row may come behind newer ones and still count [s].", "s", group=SOURCE)
     ] = 0.05,
-    cars: Annotated[
-        int, Parameter(group=SOURCE, converter=arg.whole_number, help="Cars at most; rows of others are counted.")
-    ] = 1000,
+    cars: Annotated[int, arg.whole("Cars at most; rows of others are counted.", group=SOURCE)] = 1000,
     window: arg.Window = 2.0,
     form: arg.Form = "auto",
     estimator: Annotated[
         Literal["auto", "map", "sgld", "importance"],
-        Parameter(
-            help="Posterior mode, SGLD or importance sampling; auto: the mode where jerk is measured, else importance "
-            "sampling."
+        arg.option(
+            "Posterior mode, SGLD or importance sampling; auto: the mode where jerk is measured, else"
+            " importance sampling."
         ),
     ] = "auto",
     mode: arg.Mode = "lambda",
@@ -71,18 +58,15 @@ def watch(
     seed: arg.Seed = 0,
     state: Annotated[
         Path | None,
-        Parameter(
-            group=arg.OUTPUT,
-            converter=arg.local_folder,
-            help="Folder for the cars' states; the same command goes on from there.",
+        arg.option(
+            "Folder for the cars' states; the same command goes on from there.", arg.OUTPUT, converter=arg.local_folder
         ),
     ] = None,
     out: Annotated[
-        str | None,
-        Parameter(group=arg.OUTPUT, help="File or mqtt://HOST:PORT/TOPIC for the answers; default: standard output."),
+        str | None, arg.option("File or mqtt://HOST:PORT/TOPIC for the answers; default: standard output.", arg.OUTPUT)
     ] = None,
     prometheus: Annotated[
-        str | None, Parameter(group=arg.OUTPUT, help="[HOST:]PORT for metrics; the host is 127.0.0.1 by default.")
+        str | None, arg.option("[HOST:]PORT for metrics; the host is 127.0.0.1 by default.", arg.OUTPUT)
     ] = None,
     quiet: arg.Quiet = False,
 ) -> None:

@@ -5,8 +5,7 @@ Figures are as wide as a desk's page; with `narrow` as a phone, panels one above
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -37,6 +36,7 @@ from avtorch.plots.style import (
 )
 
 _CELLS = 24  # a side of the force map
+_BINS = 30  # of a histogram
 _MOST = 7  # hypotheses in a picture
 _SECONDS = 25.0  # seconds of a drive in a picture
 
@@ -100,46 +100,11 @@ def _name_bars(ax: Axes, names: Sequence[str], *, narrow: bool, down: bool) -> N
             ax.text(0.0, i + (-0.26 if down else 0.26), name, va="bottom", fontsize=9)
 
 
-@dataclass(frozen=True)
-class DriveStretch:
-    """The stretch of the drive in which the effect does most: `time` (row,) [s] from its log's start and `lines` by
-    label, each (row,), of the quantity that `axis` names with its unit.
-    """
-
-    axis: str
-    time: FloatArray = field(repr=False)
-    lines: Mapping[str, FloatArray] = field(repr=False)
-
-
 def traces_of(found: Diagnosis) -> Traces:
     """The traces of a diagnosis. Raises `InputError` where there are none."""
     if found.traces is None:
         raise InputError("traces: the diagnosis has none to draw")
     return found.traces
-
-
-def stretch_of(found: Diagnosis) -> DriveStretch:
-    """What was measured, and what is simulated before and after the repair, where the effect does most.
-
-    The channel is the acceleration, unless only the speed shows it. Raises `InputError` where there are no traces.
-    """
-    traces = traces_of(found)
-    errors = [(traces.measured - x).std(-1) for x in (traces.before, traces.after)]
-    shows = errors[0] / np.maximum(errors[1], 1e-12)
-    # unlike the speed, the acceleration shows an event at its own time
-    k = 0 if shows[0] > 1.1 else int(np.argmax(shows))
-    of_speed = traces.channels[k] == "speed"
-    # beyond the horizon a simulated speed may be anywhere
-    seconds = min(_SECONDS, HORIZON_S) if of_speed else _SECONDS
-    inside = _liveliest(traces.time, traces.stretch, np.abs(traces.before[k] - traces.after[k]), seconds)
-    # a rollout begun at the measured speed
-    offset = [(traces.measured[k] - x[k])[inside][0] if of_speed else 0.0 for x in (traces.before, traces.after)]
-    lines = {"measured": traces.measured[k][inside], "baseline simulator": traces.before[k][inside] + offset[0]}
-    if found.winner.effects:
-        named = found.verdict.names
-        label = f"with {' and '.join(named)}" if len(named) < 3 else f"with all {len(named)} effects"
-        lines[label] = traces.after[k][inside] + offset[1]
-    return DriveStretch(LABELS[traces.channels[k]], traces.time[inside], lines)
 
 
 def _liveliest(time: FloatArray, stretch: IntArray, size: FloatArray, seconds: float) -> slice:
@@ -155,33 +120,6 @@ def _liveliest(time: FloatArray, stretch: IntArray, size: FloatArray, seconds: f
         if float(sums[first]) / width > worth:
             best, worth = slice(int(rows[first]), int(rows[first]) + width), float(sums[first]) / width
     return best
-
-
-def axes_of(found: Diagnosis) -> list[Axis]:
-    """Along which a gap may lie: those that the log has. Raises `InputError` where there are no traces."""
-    return ["time", "command"] if traces_of(found).speed is None else ["time", "speed", "command"]
-
-
-@dataclass(frozen=True)
-class EffectHistogram:
-    """Along an axis: the shares of the rows and of the effect's response between `edges` (bin + 1,), each (bin,)."""
-
-    edges: FloatArray
-    rows: FloatArray = field(repr=False)
-    effect: FloatArray = field(repr=False)
-
-
-def histogram_of(found: Diagnosis, axis: Axis, *, bins: int = 30) -> EffectHistogram:
-    """Where along one of `axes_of` the drive and the effect's response are."""
-    traces = traces_of(found)
-    x = {"time": traces.time, "command": traces.command, "speed": traces.speed}[axis]
-    assert x is not None, "one of axes_of"
-    low, high = np.quantile(x, (0.002, 0.998))
-    edges = np.linspace(low, high if high > low else low + 1, bins + 1)
-    rows, _ = np.histogram(x, edges)
-    does, _ = np.histogram(x, edges, weights=traces.does)
-    whole = does.sum()
-    return EffectHistogram(edges, rows / max(rows.sum(), 1), does / whole if whole > 0 else np.zeros(bins))
 
 
 def _label(candidate: Candidate, end: str) -> str:
@@ -209,13 +147,32 @@ def budget_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
 
 @styled
 def road_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
-    """The lines of `stretch_of` over time. Raises `InputError` where there are no traces."""
-    stretch = stretch_of(found)
+    """What was measured, and what is simulated before and after the repair, where the effect does most.
+
+    The channel is the acceleration, unless only the speed shows it. Raises `InputError` where there are no traces.
+    """
+    traces = traces_of(found)
+    errors = [(traces.measured - x).std(-1) for x in (traces.before, traces.after)]
+    shows = errors[0] / np.maximum(errors[1], 1e-12)
+    # unlike the speed, the acceleration shows an event at its own time
+    k = 0 if shows[0] > 1.1 else int(np.argmax(shows))
+    of_speed = traces.channels[k] == "speed"
+    # beyond the horizon a simulated speed may be anywhere
+    seconds = min(_SECONDS, HORIZON_S) if of_speed else _SECONDS
+    inside = _liveliest(traces.time, traces.stretch, np.abs(traces.before[k] - traces.after[k]), seconds)
+    measured, before, after = (x[k][inside] for x in (traces.measured, traces.before, traces.after))
+    if of_speed:  # a rollout begun at the measured speed
+        before, after = (x + measured[0] - x[0] for x in (before, after))
     figure, (ax,) = panels_of(1, 3.3, narrow=narrow)
-    for (label, values), colour in zip(stretch.lines.items(), (BLACK, VERMILLION, BLUE), strict=False):
-        ax.plot(stretch.time, values, color=colour, lw=1.2 if colour == BLACK else None, label=label)
+    time = traces.time[inside]
+    ax.plot(time, measured, color=BLACK, lw=1.2, label="measured")
+    ax.plot(time, before, color=VERMILLION, label="baseline simulator")
+    if found.winner.effects:
+        named = found.verdict.names
+        label = f"with {' and '.join(named)}" if len(named) < 3 else f"with all {len(named)} effects"
+        ax.plot(time, after, color=BLUE, label=label)
     epochs_s = found.log.epochs_s
-    ax.set(xlabel=time_label(epochs_s[0] if len(epochs_s) == 1 else 0.0), ylabel=stretch.axis)
+    ax.set(xlabel=time_label(epochs_s[0] if len(epochs_s) == 1 else 0.0), ylabel=LABELS[traces.channels[k]])
     ax.margins(x=0)
     legend(figure, [ax], narrow=narrow)
     return figure
@@ -223,14 +180,20 @@ def road_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
 
 @styled
 def where_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
-    """Where the gap lies: along every axis that the log has the shares of `histogram_of`, and the named parts."""
-    axes = axes_of(found)
-    figure, panels = panels_of(len(axes), 2.6, narrow=narrow)
-    for i, (ax, axis) in enumerate(zip(panels, axes, strict=True)):
-        shares = histogram_of(found, axis)
-        ax.stairs(shares.rows, shares.edges, fill=True, facecolor="#DDDDDD", edgecolor=GREY, lw=0.8, label="the drive")
-        if shares.effect.any():
-            ax.stairs(shares.effect, shares.edges, color=BLUE, lw=1.6, label="the effect")
+    """Where the gap lies: along every axis that the log has the shares of the rows and of the effect's response, and
+    the named parts. Raises `InputError` where there are no traces."""
+    traces = traces_of(found)
+    axes: dict[Axis, FloatArray | None] = {"time": traces.time, "speed": traces.speed, "command": traces.command}
+    there: dict[Axis, FloatArray] = {axis: x for axis, x in axes.items() if x is not None}
+    figure, panels = panels_of(len(there), 2.6, narrow=narrow)
+    for i, (ax, (axis, x)) in enumerate(zip(panels, there.items(), strict=True)):
+        low, high = np.quantile(x, (0.002, 0.998))
+        edges = np.linspace(low, high if high > low else low + 1, _BINS + 1)
+        rows, does = (np.histogram(x, edges, weights=weights)[0] for weights in (None, traces.does))
+        look = {"fill": True, "facecolor": "#DDDDDD", "edgecolor": GREY, "lw": 0.8}
+        ax.stairs(rows / max(rows.sum(), 1), edges, label="the drive", **look)
+        if does.sum() > 0:
+            ax.stairs(does / does.sum(), edges, color=BLUE, lw=1.6, label="the effect")
         away = found.log.epochs_s[0] if axis == "time" else 0.0
         for part in found.where:
             if part.axis == axis and not isinstance(part.begin, str) and not isinstance(part.end, str):
@@ -297,7 +260,7 @@ def _force_contours(ax: Axes, found: Diagnosis) -> None:
     most = max(float(np.abs(table).max()), 1e-6)
     drawn = ax.contourf(v, u, table, levels=np.linspace(-most, most, 13), cmap="RdBu_r")
     ax.figure.colorbar(drawn, ax=ax, label="force beyond K u [m/s²]", format="%.2g")
-    across, along, driven = driven_cells(found)
+    across, along, driven = _driven_cells(found)
     # contourf takes values in the middle of cells
     middle = [0.5 * (x[1:] + x[:-1]) for x in (across, along)]
     ax.contourf(*middle, (~driven).T.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
@@ -320,7 +283,7 @@ def _resistance_line(ax: Axes, found: Diagnosis) -> None:
     ax.set(xlabel="speed [m/s]", ylabel="acceleration [m/s²]")
 
 
-def driven_cells(found: Diagnosis) -> tuple[FloatArray, FloatArray, BoolArray]:
+def _driven_cells(found: Diagnosis) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Edges of cells in speed [m/s] and command [m/s²], and whether the drive was in each (speed, command)."""
     form, traces = found.free_form, found.traces
     assert form is not None

@@ -331,10 +331,10 @@ def experiment_figure(experiment: Experiment, *, narrow: bool = False) -> Figure
     figure = Figure(figsize=(NARROW, 4.2) if narrow else (WIDE, 4.0), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True)
     top.axhline(0.0, color=GREY, lw=0.6)
-    top.step(m.time, m.command, where="post", color=BLUE)
+    top.step(m.time, m.command, where="post", color=BLUE, label="command")
     top.set(ylabel="command [m/s²]")
     top.set_title(m.name, loc="left")
-    bottom.plot(m.time, m.speed, color=ORANGE)
+    bottom.plot(m.time, m.speed, color=ORANGE, label="expected speed")
     bottom.set(xlabel="time [s]", ylabel="expected speed [m/s]", ylim=(0, 1.15 * float(m.speed.max())))
     bottom.margins(x=0)
     return figure

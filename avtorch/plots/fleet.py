@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from avtorch.plots.style import BLACK, BLUE, GREY, ORANGE, VERMILLION, styled
+from avtorch.plots.style import BLACK, BLUE, GREY, ORANGE, VERMILLION, panels_of, styled
 
 FEW = 60
 """Cars that are drawn one by one, each with its intervals."""
@@ -99,8 +99,7 @@ def stability_of_cars(ax: Axes, cars: Sequence[Car], target: float) -> Axes:
 @styled
 def fleet_figure(answer: Mapping[str, Any], *, narrow: bool = False) -> Figure:
     """Cars of a fleet's answer by T_L and K_L, beside their P(string stable); `narrow`: for a phone."""
-    figure = Figure(figsize=(4.0, 6.4) if narrow else (8.6, 3.6), layout="constrained")
-    first, second = figure.subplots(2, 1) if narrow else figure.subplots(1, 2)
+    figure, (first, second) = panels_of(2, 3.6, narrow=narrow)
     actuation_of_cars(first, answer["cars"])
     stability_of_cars(second, answer["cars"], answer["target"])
     first.set_title("Actuation", loc="left")

@@ -12,6 +12,7 @@ from avtorch.errors import InputError
 from avtorch.follower import FollowerDiagnosis
 from avtorch.plots.style import BLACK, BLUE, GREY, VERMILLION, styled
 
+_MOST = 4.0  # of an axis of peak gains
 _WORDS = {"headway_s": "headway [s]", "lag_with_delay_s": "lag with delay [s]"}
 
 
@@ -29,10 +30,10 @@ def parameter_of_each(ax: Axes, cars: Sequence[FollowerDiagnosis], name: str) ->
     return ax
 
 
-def peak_gain_of_each(ax: Axes, cars: Sequence[FollowerDiagnosis], *, most: float = 4.0) -> Axes:
+def peak_gain_of_each(ax: Axes, cars: Sequence[FollowerDiagnosis]) -> Axes:
     """Peak gain at the median speed, a row a car; above 1 the leader's motion grows from car to car.
 
-    Rows of cars whose loop may be unstable are left empty; gains above `most` are cut off.
+    Rows of cars whose loop may be unstable are left empty; gains above 4 are cut off.
     """
     rows = np.arange(len(cars))[::-1]
     for row, car in zip(rows, cars, strict=True):
@@ -40,11 +41,11 @@ def peak_gain_of_each(ax: Axes, cars: Sequence[FollowerDiagnosis], *, most: floa
         if q is None:
             continue
         colour = VERMILLION if car.usual.p_string_stable < 0.05 else BLACK if car.usual.p_string_stable < 0.95 else BLUE
-        ax.hlines(row, q.q05, min(q.q95, most), color=colour)
-        ax.plot(min(q.mean, most), row, "o", color=colour, ms=4)
+        ax.hlines(row, q.q05, min(q.q95, _MOST), color=colour)
+        ax.plot(min(q.mean, _MOST), row, "o", color=colour, ms=4)
     ax.axvline(1.0, color=GREY, lw=0.8)
     ax.set_yticks(rows, [car.name for car in cars])
-    ax.set(xlabel="peak gain [-]", ylim=(-0.6, len(cars) - 0.4), xlim=(0.9, most))
+    ax.set(xlabel="peak gain [-]", ylim=(-0.6, len(cars) - 0.4), xlim=(0.9, _MOST))
     return ax
 
 

@@ -260,7 +260,7 @@ def region_figure(
         ax.set_title(title)
         ax.label_outer()
     columns = 1 if narrow else 3
-    figure.legend(handles=_handles(axes), loc="outside lower center", ncols=columns, fontsize=8.5)
+    figure.legend(handles=_handles(list(axes)), loc="outside lower center", ncols=columns, fontsize=8.5)
     return figure
 
 

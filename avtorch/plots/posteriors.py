@@ -36,6 +36,7 @@ CONTOURS: dict[str, Any] = {
     "exact": {"color": BLACK, "linestyle": "-", "linewidth": 1.4},
     "NUTS": {"color": VERMILLION, "linestyle": "--", "linewidth": 1.4},
 }
+TAIL = 5e-4
 #: Most bins of a histogram, and bins of ranks.
 BINS, RANKS = 2000, 10
 
@@ -100,21 +101,17 @@ def marginals(
     return ax
 
 
-def exact_density(
-    quadrature: Quadrature, name: str, window: int = 0, *, points: int = 400, tail: float = 5e-4
-) -> tuple[np.ndarray, np.ndarray]:
+def exact_density(quadrature: Quadrature, name: str, window: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """A marginal as a smooth curve: values in the parameter's unit and the density there, per that unit.
 
-    The nodes' masses are band-limited, so their sinc interpolant is as exact as the grid (as in `Quadrature.cdf`).
-
-    Args:
-        tail: mass left out at either end.
+    The nodes' masses are band-limited, so their sinc interpolant is as exact as the grid (as in `Quadrature.cdf`). A
+    mass of `TAIL` is left out at either end.
     """
     i = quadrature.names.index(name)
     nodes, mass = quadrature.nodes[window, i], quadrature.mass[window, i]
     spacing = nodes[1] - nodes[0]
-    ends = torch.stack([quadrature.quantile(q)[window, i] for q in (tail, 1 - tail)]).log()
-    z = ends[0] + (ends[1] - ends[0]) * torch.linspace(0, 1, points, dtype=nodes.dtype)
+    ends = torch.stack([quadrature.quantile(q)[window, i] for q in (TAIL, 1 - TAIL)]).log()
+    z = ends[0] + (ends[1] - ends[0]) * torch.linspace(0, 1, 400, dtype=nodes.dtype)
     per_log = torch.sinc((z[:, None] - nodes) / spacing) @ mass / spacing
     return z.exp().numpy(), (per_log.clamp_min(0.0) / z.exp()).numpy()
 

@@ -33,7 +33,7 @@ def standard_command() -> tuple[Tensor, Tensor]:
     return time, command
 
 
-def standard_response(effect: Effect | None, *, seed: int = _SEED) -> Response:
+def standard_response(effect: Effect | None) -> Response:
     """Response of GLVD (0.3 s, 1), with `effect` if one is given, to the standard command; random ones are drawn.
 
     An effect that depends on speed gets the speed of this response, found by iteration.
@@ -42,14 +42,14 @@ def standard_response(effect: Effect | None, *, seed: int = _SEED) -> Response:
     first = torch.full_like(time, 12.0 if effect is None else shown_at(effect))
     drive = SimulatorInput(time, command, first, 0.0 if effect is None or effect.place != "body" else None)
     car = plant([] if effect is None else [effect])
-    response = car.response(drive, generator=torch.Generator().manual_seed(seed))
+    response = car.response(drive, generator=torch.Generator().manual_seed(_SEED))
     for _ in range(4):
         drive = replace(drive, speed=response.speed.clamp_min(0.0))
-        response = car.response(drive, generator=torch.Generator().manual_seed(seed))
+        response = car.response(drive, generator=torch.Generator().manual_seed(_SEED))
     return response
 
 
-def effect_signature(ax: Axes, effect: Effect, *, seed: int = _SEED) -> Axes:
+def effect_signature(ax: Axes, effect: Effect) -> Axes:
     """Plot the measured acceleration [m/s²] with `effect` and without, over the standard command.
 
     Of an effect on the measured speed it is that speed's slope. Below lies the gap, magnified by the factor that is
@@ -64,7 +64,7 @@ def effect_signature(ax: Axes, effect: Effect, *, seed: int = _SEED) -> Axes:
         True
     """
     time, command = standard_command()
-    with_it, without = (_shown(standard_response(e, seed=seed), effect.reading) for e in (effect, None))
+    with_it, without = (_shown(standard_response(e), effect.reading) for e in (effect, None))
     gap = with_it - without
     factor = next((f for f in _FACTORS if f * float(gap.abs().max()) >= 0.45), _FACTORS[-1])
     ax.step(time, command, where="post", color=GREY, linewidth=0.8, alpha=0.7, label="command")

@@ -15,9 +15,12 @@ from pathlib import Path
 from typing import Any, ParamSpec
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.patches import StepPatch
 
+from avtorch.arrays import FloatArray
 from avtorch.display.notebook import notebook_display
 from avtorch.io import atomic
 
@@ -173,21 +176,37 @@ def show(figure: Figure, path: str | os.PathLike[str]) -> None:
         return
     # the file's pixels at the figure's size, so that it is sharp on any screen
     width = round(figure.get_figwidth() * STYLE["figure.dpi"])
-    display.display(display.Image(_png(figure), width=width, alt=_alternative(figure)))
+    display.display(display.Image(_png(figure), width=width, alt=words_of(figure)))
 
 
-def _alternative(figure: Figure) -> str:
-    """What is drawn over what, for readers who do not see it: titles, labels and legends of the axes."""
+def words_of(figure: Figure) -> str:
+    """What is drawn over what, for readers who do not see it: titles, labels and legends of the axes, and how far each
+    line goes."""
     parts = []
     for ax in figure.axes:
         # an axes that shares its label has none of its own
         over = [text for text in (ax.get_ylabel(), ax.get_xlabel()) if text]
         what = ": ".join(text for text in (ax.get_title(loc="left") or ax.get_title(), " over ".join(over)) if text)
-        names = [label for label in ax.get_legend_handles_labels()[1] if label]
+        lines = lines_of(ax)
+        names = [
+            f"{label} {np.nanmin(lines[label][:, 1]):.3g} to {np.nanmax(lines[label][:, 1]):.3g}"
+            if label in lines and np.isfinite(lines[label][:, 1]).any()
+            else label
+            for label in dict.fromkeys(ax.get_legend_handles_labels()[1])
+        ]
         if what:
             parts.append(" ".join(f"{what}{', with ' if names else ''}{', '.join(names)}.".split()))
     # as words, not as formulas
     return re.sub(r"[$\\{}]", "", " ".join(["Figure.", *parts]))
+
+
+def lines_of(ax: Axes) -> dict[str, FloatArray]:
+    """The lines and stairs of an axes by their labels, each (point, 2), without those that only mark a place."""
+    lines = {str(line.get_label()): np.asarray(line.get_xydata(), float) for line in ax.lines}
+    for stairs in (patch for patch in ax.patches if isinstance(patch, StepPatch)):
+        height, edges, _ = stairs.get_data()
+        lines[str(stairs.get_label())] = np.column_stack([0.5 * (edges[1:] + edges[:-1]), height])
+    return {label: points for label, points in lines.items() if label[:1] != "_" and len(points) > 2}
 
 
 def _png(figure: Figure) -> bytes:

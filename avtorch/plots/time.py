@@ -34,6 +34,8 @@ Steps = Sequence[tuple[float, float]]
 Motion = Mapping[str, Mapping[str, ArrayLike]]
 """Traces of a run: `{"speed": {"leader": ..., "without action": ..., "with action": ...}, "accel": {...}, ...}`."""
 
+TARGET = 0.95
+"""P(string stable) below which a setting is to be changed."""
 _WIDE = 9.0  # inches
 _ABOVE: Any = {"where": "upper center", "columns": 4, "last": ("vehicle changes", "alert", "action")}
 
@@ -93,11 +95,9 @@ def belief_band(
     return _span(ax, _ends(windows))
 
 
-def string_probability(
-    ax: Axes, windows: Windows, *, required: float = 0.95, actions: Iterable[Mapping[str, Any]] = ()
-) -> Axes:
+def string_probability(ax: Axes, windows: Windows, *, actions: Iterable[Mapping[str, Any]] = ()) -> Axes:
     """P(string stable) of the setting in force, over time, as it could be known: from a window's end on (a dot, red
-    below `required`), and from an action on that of the setting it chose.
+    below the target), and from an action on that of the setting it chose.
     """
     ends = [(w["end_s"], w["p_string_stable"]) for w in windows]
     chosen = [(a["time_s"], a["p_string_stable"]) for a in actions if a.get("p_string_stable") is not None]
@@ -107,11 +107,11 @@ def string_probability(
         ax.fill_between(x, p, step="post", color=SKY, alpha=0.25, linewidth=0)
         ax.step(x, p, where="post", color=BLUE)
         for below, colour, size in ((False, BLUE, 3), (True, VERMILLION, 6)):
-            some = [(t, value) for t, value in ends if (value < required) == below]
+            some = [(t, value) for t, value in ends if (value < TARGET) == below]
             if some:
                 ax.plot(*zip(*some, strict=True), marker="o", markersize=size, linestyle="none", color=colour, zorder=3)
     # in the legend: beside its line a label would lie over dots and alerts
-    ax.axhline(required, color=GREY, linestyle=(0, (1, 1.5)), linewidth=1.2, label=f"target {required:g}")
+    ax.axhline(TARGET, color=GREY, linestyle=(0, (1, 1.5)), linewidth=1.2, label=f"target {TARGET:g}")
     ax.set_ylim(-0.02, 1.05)
     ax.set_ylabel("P(string stable) [-]")
     return _span(ax, _ends(windows))
@@ -123,27 +123,15 @@ def events(
     change_s: float | None = None,
     alerts: Iterable[Mapping[str, Any]] = (),
     actions: Iterable[Mapping[str, Any]] = (),
-    label: bool = True,
 ) -> Axes:
-    """Mark the change of the vehicle, the alerts and the actions on a time axis.
-
-    Example:
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.plots import events
-        >>> alert = {"time_s": 28.0, "detector": "stability", "why": "P(string stable) is 0.02"}
-        >>> ax = events(Figure().subplots(), change_s=26.0, alerts=[alert])
-        >>> len(ax.lines)
-        2
-    """
+    """Mark the change of the vehicle, the alerts and the actions on a time axis."""
     # an action follows its alert at once: its line is broad and pale so that the thin alert on top stays visible
     for i, time in enumerate(sorted({a["time_s"] for a in alerts})):
-        ax.axvline(time, color=ORANGE, alpha=0.45, linewidth=5, zorder=1.7, label="alert" if label and i == 0 else None)
+        ax.axvline(time, color=ORANGE, alpha=0.45, linewidth=5, zorder=1.7, label=None if i else "alert")
     for i, action in enumerate(actions):
-        text = "action" if label and i == 0 else None
-        ax.axvline(action["time_s"], color=GREEN, linewidth=1.6, zorder=1.9, label=text)
+        ax.axvline(action["time_s"], color=GREEN, linewidth=1.6, zorder=1.9, label=None if i else "action")
     if change_s is not None:
-        text = "vehicle changes" if label else None
-        ax.axvline(change_s, color=BLACK, linestyle=":", linewidth=1.4, zorder=1.8, label=text)
+        ax.axvline(change_s, color=BLACK, linestyle=":", linewidth=1.4, zorder=1.8, label="vehicle changes")
     return ax
 
 
@@ -279,9 +267,7 @@ def belief_figure(
 
 
 @styled
-def probability_figure(
-    windows: Windows, *, answer: Mapping[str, Any] | None = None, required: float = 0.95, narrow: bool = False
-) -> Figure:
+def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = None, narrow: bool = False) -> Figure:
     """P(string stable) over time, with alerts and actions; each action is labelled with the setting it chose.
 
     Example:
@@ -297,9 +283,7 @@ def probability_figure(
     windows, answer = from_start(windows, epoch_s), _from_start(answer, epoch_s)
     figure = Figure(figsize=(NARROW if narrow else _WIDE, 3.6), layout="constrained")
     ax = figure.subplots()
-    string_probability(
-        _events_of(ax, answer or {}), windows, required=required, actions=(answer or {}).get("actions") or ()
-    )
+    string_probability(_events_of(ax, answer or {}), windows, actions=(answer or {}).get("actions") or ())
     for i, action in enumerate((answer or {}).get("actions") or []):
         names = " + ".join(str(s) for s in action["strategies"]) or "none"
         ax.annotate(f"strategy {names}", (action["time_s"], 0.04 + 0.09 * (i % 4)), (4, 0), textcoords="offset points",
@@ -317,7 +301,6 @@ def overview_figure(
     *,
     truth: Mapping[str, Steps] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
-    required: float = 0.95,
     narrow: bool = False,
 ) -> Figure:
     """A run at one glance: acceleration, belief about lag and gain, P(string stable).
@@ -343,7 +326,7 @@ def overview_figure(
     motion(axes[0], time, traces["accel"], quantity="accel")
     for ax, name in zip(axes[1:3], ("T_L", "K_L"), strict=True):
         belief_band(ax, answer["windows"], name, truth=(truth or {}).get(name), bounds=(bounds or {}).get(name))
-    string_probability(axes[3], answer["windows"], required=required, actions=answer["actions"])
+    string_probability(axes[3], answer["windows"], actions=answer["actions"])
     axes[3].set_xlabel("time [s]")
     legend(figure, axes, narrow=narrow, **_ABOVE)
     return figure

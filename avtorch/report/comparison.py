@@ -177,8 +177,8 @@ def _ratios(what: str, ratios: Mapping[str, Quantity], table: Table, caption: st
     return picture_of(
         "ratios",
         lambda narrow: ratio_figure(ratios, what, narrow=narrow),
-        f"Ratios {what} with their 90 % intervals, beside one: {told}.",
         table,
+        says=f"Ratios {what} with their 90 % intervals, beside one: {told}.",
         caption=caption,
         opened=True,
     )

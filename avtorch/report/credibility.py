@@ -10,14 +10,12 @@ from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
 
-import numpy as np
-
 from avtorch.gap.quantity import unit_of, words_of
 from avtorch.gap.result import sentences
 from avtorch.gap.result.budget import percent as share_of
 from avtorch.gap.result.diagnosis import Diagnosis
-from avtorch.gap.result.manoeuvres import Manoeuvre, manoeuvres
-from avtorch.report.diagnosis_tables import budget_table, candidate_table, measure_table
+from avtorch.gap.result.manoeuvres import manoeuvres
+from avtorch.report.diagnosis_tables import BAND, budget_table, candidate_table, manoeuvre_table, measure_table
 from avtorch.report.page import Origin, Page, Section, markdown, written
 from avtorch.report.table import Table
 
@@ -29,7 +27,6 @@ _ASSUMED = (
     "What commands, speed and place do not predict is noise, of a spectrum fitted with each hypothesis.",
     "Parameters have the priors that are printed beside each effect in avtorch's documentation.",
 )
-_BAND = 0.95
 _SILENT = (
     "Management of models, data and people: releases, training, who approved what.",
     "Verification of the simulator's code and of its numerical solution: only its output is compared here.",
@@ -190,25 +187,11 @@ def _uncertainty(found: Diagnosis) -> Section:
 
 
 def _manoeuvres(found: Diagnosis) -> Section:
-    """Peak, rise, lag, and the band about the measured acceleration that holds most of a manoeuvre."""
     if found.traces is None:
         return Section("Manoeuvres")
-    columns = ("manoeuvre", "signal", "peak [m/s²]", "rise [s]", "lag [s]", f"band of {100 * _BAND:.0f} % [m/s²]")
-    rows = []
-    for one in manoeuvres(found.traces, named=bool(found.winner.effects)):
-        for name, response in one.responses.items():
-            times = ("" if x is None else f"{x:.2f}" for x in (response.rise, response.lag))
-            title = f"{one.kind} at {one.begin:.1f} s, drive {one.log + 1}"
-            rows.append((title, name, f"{response.peak:.2f}", *times, _band(one, name)))
+    table = manoeuvre_table(found, manoeuvres(found.traces, named=bool(found.winner.effects)))
     said = (
-        f"A band of ±x about the measured acceleration holds {100 * _BAND:.0f} % of the simulated rows of a manoeuvre. "
+        f"A band of ±x about the measured acceleration holds {100 * BAND:.0f} % of the simulated rows of a manoeuvre. "
         "ISO 19364 compares by bands of tolerance, which it states for steering; none is applied here."
     )
-    table = Table("Manoeuvres in which the baseline errs most", columns, tuple(rows), numeric=columns[2:])
-    return Section("Manoeuvres", (said if rows else "None was recognised.",), tables=(table,))
-
-
-def _band(one: Manoeuvre, name: str) -> str:
-    if name in ("command", "measured"):
-        return ""
-    return f"±{np.quantile(np.abs(one.lines[name] - one.lines['measured']), _BAND):.2g}"
+    return Section("Manoeuvres", (said if table.rows else "None was recognised.",), tables=(table,))

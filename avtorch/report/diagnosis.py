@@ -9,32 +9,34 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from avtorch.arrays import FloatArray
 from avtorch.experiment import Experiment
 from avtorch.gap.result import sentences
-from avtorch.gap.result.budget import UNITS
 from avtorch.gap.result.budget import percent as share_of
 from avtorch.gap.result.diagnosis import Diagnosis
-from avtorch.gap.result.manoeuvres import Manoeuvre, manoeuvres
+from avtorch.gap.result.manoeuvres import manoeuvres
+from avtorch.gap.result.residuals import BLOCK_S, BinnedMeans, Residuals
 from avtorch.plots import diagnosis as drawings
 from avtorch.plots import drive
 from avtorch.report.diagnosis_tables import (
     budget_table,
     candidate_table,
     family_table,
+    manoeuvre_name,
+    manoeuvre_table,
     measure_table,
     place_table,
     setting_table,
 )
-from avtorch.report.page import Origin, Page, Picture, Section, picture_of, small_picture, written
-from avtorch.report.residuals import residuals
-from avtorch.report.table import Table, of_numbers
+from avtorch.report.page import Origin, Page, Picture, Section, picture_of, written
+from avtorch.report.table import Table
 
 if TYPE_CHECKING:
     from avtorch.report.page import Tone
 
-_MOST = 60  # rows of a table behind a picture of lines
 _PARTS = 12  # of the drive, rows of its table
 _ALARMS = 6  # named in the words below a picture
+_LEAST = 100  # rows of residuals from which there is something to see
 _NOT_COUNTED = {
     "driver": "grey, the driver's hand",
     "standstill": "hatched upwards, standstill",
@@ -92,7 +94,7 @@ def report_html(
                 "Which effect", pictures=(_which(found),), tables=() if budget is None else (family_table(budget),)
             ),
             _manoeuvres(found),
-            residuals(found),
+            _residuals(found),
             _shrinkage(found),
             _setting(found),
             Section(
@@ -181,38 +183,25 @@ def _budget(found: Diagnosis) -> Picture | None:
         )
     table = budget_table(budget, found.log.epochs_s[0])
     draw = lambda narrow: drawings.budget_figure(found, narrow=narrow)  # noqa: E731
-    return picture_of("budget", draw, says, table, caption=caption, opened=True)
+    return picture_of("budget", draw, table, says=says, caption=caption, opened=True)
 
 
 def _free_form(found: Diagnosis) -> Picture | None:
     form = found.free_form
     if form is None or not form.sizes.any:
         return None
-    u, v = form.knots_u, form.knots_v
-    columns, rows, says = ["speed [m/s]"], v[:, None], []
-    across, _, cells = drawings.driven_cells(found)
-    low, high = across[[0, -1]]
+    columns, values = ["speed [m/s]"], [form.knots_v]
     if form.sizes.table > 0:
-        says.append(
-            f"Contours of the force beyond K u over speed, {low:.3g} to {high:.3g} m/s, and command, {u[0]:.2g} to "
-            f"{u[-1]:.2g} m/s²: {form.at.table.min():.2g} to {form.at.table.max():.2g} m/s²; {100 * cells.mean():.0f} "
-            "% of the cells were driven."
-        )
-        columns += [f"force beyond K u at {x:.2g} m/s² [m/s²]" for x in u]
-        rows = np.column_stack([rows, form.at.table.T])
+        columns += [f"force beyond K u at {x:.2g} m/s² [m/s²]" for x in form.knots_u]
+        values += list(form.at.table)
     if form.sizes.resistance > 0:
-        curve = np.interp(across, v, form.at.curve)
-        says.append(
-            f"A line of the resistance, at the speeds driven {curve.min():.2g} to {curve.max():.2g} m/s²; at others it "
-            "goes on along a line."
-        )
         columns.append("resistance [m/s²]")
-        rows = np.column_stack([rows, form.at.curve])
+        values.append(form.at.curve)
+    rows = tuple(tuple(f"{x:.3g}" for x in row) for row in zip(*values, strict=True))
     return picture_of(
         "free_form",
         lambda narrow: drawings.free_form_figure(found, narrow=narrow),
-        " ".join(says),
-        of_numbers("What the repaired simulator carries without a name", columns, rows, (".3g",) * len(columns)),
+        Table("What the repaired simulator carries without a name", tuple(columns), rows, numeric=columns),
         caption="What the car's force does beyond the gain and what was named, as the repaired simulator carries it. "
         "Hatched: not driven; there nothing but its smoothness speaks, and far from the drive it goes back to K u. A "
         "dead band, a limit or an asymmetry of the drive may hide in it.",
@@ -240,12 +229,9 @@ def _drive(found: Diagnosis) -> Picture | None:
             sizes = [np.std(traces.measured[k][part]), *(np.sqrt(np.mean(x[k][part] ** 2)) for x in errors)]
             cells += [f"{size:.3f}" for size in sizes]
         rows.append(tuple(cells))
-    named = " and that with what was named" if found.winner.effects else ""
     return picture_of(
         "drive",
         lambda narrow: drive.drive_figure(found, narrow=narrow),
-        f"Lines over the whole drive, {axis.along[0]:.0f} to {axis.along[-1]:.0f} s: the command, the measured "
-        f"{' and '.join(traces.channels)}, the baseline simulator{named}.{_marked(axis)}",
         Table("The drive in parts: standard deviation of each signal, RMS of each error", tuple(columns), tuple(rows)),
         caption="Each line shows the least and the greatest value of short intervals. Simulated lines come from the "
         f"logged commands; every ten seconds a speed begins at the measured one.{_marked(axis)}{_fit(found)}",
@@ -289,32 +275,15 @@ def _road(found: Diagnosis) -> Picture | None:
     traces = found.traces
     if traces is None:
         return None
-    stretch = drawings.stretch_of(found)
-    quantity, unit = stretch.axis.rstrip("]").split(" [")
-    labels, lines = list(stretch.lines), list(stretch.lines.values())
-    off = " and ".join(
-        f"{np.sqrt(np.mean((line - lines[0]) ** 2)):.2g} {unit} {label}"
-        for label, line in zip(labels[1:], lines[1:], strict=True)
-    )
     which = "The stretch of the drive in which the effect is strongest."
     if (traces.before == traces.after).all():
         which = "The beginning of the drive; nothing was named that another stretch would show better."
-    columns = ("time [s]", *(f"{label} [{unit}]" for label in labels))
-    rows = _some(np.column_stack([stretch.time, *lines]))
     return picture_of(
         "road",
         lambda narrow: drawings.road_figure(found, narrow=narrow),
-        f"Lines of {quantity} over time, {stretch.time[0]:.0f} to {stretch.time[-1]:.0f} s: "
-        f"{', '.join(labels)}. RMS error: {off}.",
-        of_numbers(f"The {quantity} in this stretch", columns, rows, (".2f", *(".3f" for _ in labels))),
         caption=f"{which} Simulated lines: the simulator gets the logged commands and never the measured acceleration; "
         "its speed starts at the measured one.",
     )
-
-
-def _some(rows: np.ndarray) -> Sequence[Sequence[float]]:
-    """At most `_MOST` of the rows, evenly spaced, the first among them."""
-    return rows[:: -(-len(rows) // _MOST)].tolist()
 
 
 # where, which, how far ---------------------------------------------------------------------------------------------
@@ -323,22 +292,9 @@ def _where(found: Diagnosis) -> Picture | None:
     # where nothing is missing no effect is named whose place could be drawn
     if traces is None or not traces.does.any() or found.verdict.name == "none":
         return None
-    axes = drawings.axes_of(found)
-    tables = []
-    for axis in axes:
-        shares = drawings.histogram_of(found, axis, bins=15)
-        rows = [
-            (f"{a:.3g} to {b:.3g}", f"{100 * rows:.0f} %", f"{100 * effect:.0f} %")
-            for a, b, rows, effect in zip(shares.edges, shares.edges[1:], shares.rows, shares.effect, strict=False)
-        ]
-        columns = (f"{axis} [{UNITS[axis]}]", "share of the drive", "share of the effect")
-        tables.append(Table(f"Along {axis}", columns, tuple(rows), numeric=columns[1:]))
-    said = " ".join(sentences.where(found)) or "No part of the drive stands out."
     return picture_of(
         "where",
         lambda narrow: drawings.where_figure(found, narrow=narrow),
-        f"Histograms along {', '.join(axes)}: the share of the drive beside the share of the effect. {said}",
-        *tables,
         caption="Where the blue line is above the grey ground, the effect acts more than its share of the drive.",
     )
 
@@ -348,8 +304,8 @@ def _which(found: Diagnosis) -> Picture:
     return picture_of(
         "which",
         lambda narrow: drawings.which_figure(found, narrow=narrow),
-        f"Bars of the probability of each hypothesis: {bars}.",
         candidate_table(found),
+        says=f"Bars of the probability of each hypothesis: {bars}.",
         caption="Blue, and bold in the table: the alias set, which this log cannot distinguish from the verdict. "
         "Probabilities were calibrated on simulated drives. The nats behind them are raw log evidence over none, which "
         "is far overconfident.",
@@ -370,13 +326,9 @@ def _shrinkage(found: Diagnosis) -> Section:
     measures = measure_table(scores)
     if len({metric.horizon_s for metric in scores.by_metric.values()}) < 2:
         return Section(title, (how,), tables=(measures,))
-    top = scores.by_metric[scores.metric]
     drawn = picture_of(
         "shrinkage",
         lambda narrow: drawings.shrinkage_figure(found, narrow=narrow),
-        "Bars of the error in held-out rollouts: baseline simulator, baseline with a black box, with the "
-        f"effect, noise floor. By the measure that decides, {top.before:.2g} without and {top.after:.2g} with the "
-        f"effect, of which {top.floor:.2g} is noise.",
         measures,
         caption="Bold in the table: the measure that decides.",
         opened=True,
@@ -396,15 +348,9 @@ def _setting(found: Diagnosis) -> Section:
 
 
 def _next(experiment: Experiment) -> Picture:
-    m = experiment.manoeuvre
-    columns = ("time [s]", "command [m/s²]", "expected speed [m/s]")
-    rows = _some(np.column_stack([m.time, m.command, m.speed]))
     return picture_of(
         "next",
         lambda narrow: drive.experiment_figure(experiment, narrow=narrow),
-        f"Lines over {m.time[-1]:.0f} s: a command of {m.command.min():.2g} to {m.command.max():.2g} m/s² and the "
-        f"expected speed, {m.speed.min():.2g} to {m.speed.max():.2g} m/s.",
-        of_numbers(f"The manoeuvre {m.name}", columns, rows, (".1f", ".2f", ".1f")),
         caption="The commands row by row are in manoeuvre.csv. A command holds until the next row; the speed is the "
         "prediction of the most probable hypothesis. Use a level road if there is one.",
     )
@@ -416,36 +362,119 @@ def _manoeuvres(found: Diagnosis) -> Section:
     title, traces = "Manoeuvre by manoeuvre", found.traces
     if traces is None:
         return Section(title)
-    several = len(found.log.epochs_s) > 1
     each = manoeuvres(traces, named=bool(found.winner.effects))
-    columns = ("signal", "peak [m/s²]", "rise, 10 to 90 % [s]", "lag behind the command [s]")
-    pictures = []
-    for i, one in enumerate(each):
-        of = f" of drive {one.log + 1}" if several else ""
-        name = f"{one.kind.capitalize()} at {one.begin:.1f} s{of}, a command {one.change:+.2g} m/s²"
-        rows = [
-            (label, f"{r.peak:.2f}", *("" if x is None else f"{x:.2f}" for x in (r.rise, r.lag)))
-            for label, r in one.responses.items()
-        ]
+    pictures = [
+        picture_of(
+            f"manoeuvre-{i}",
+            drive.manoeuvre_figure(one, traces),
+            caption=f"{manoeuvre_name(found, one)}, a command {one.change:+.2g} m/s²: {100 * one.share:.2g} % of the "
+            "baseline's squared error.",
+        )
+        for i, one in enumerate(each)
+    ]
+    said = ("Where the baseline simulator errs most, the worst first.",) if pictures else ()
+    return Section(title, said, small=pictures, tables=(manoeuvre_table(found, each),))
+
+
+# what is left of the gap -------------------------------------------------------------------------------------------
+def _residuals(found: Diagnosis) -> Section:
+    """The residuals of a diagnosis; nothing where there is too little to show."""
+    title = "What is left: residuals"
+    if found.traces is None or len(found.traces.time) < _LEAST:
+        return Section(title)
+    left = drive.residuals_of(found)
+    if len(left.time) < _LEAST:
+        return Section(title)
+    both = drive.sides(found, left)
+    against: list[tuple[drive.Against, FloatArray]] = [("command", left.command)]
+    if left.speed is not None:
+        against.append(("speed", left.speed))
+    pictures = [_residual_against(found, left, both, name, axis) for name, axis in against]
+    last = list(both.values())[-1]
+    pictures.append(
+        picture_of(
+            "residual-correlation",
+            drive.residual_figure(found, "earlier commands"),
+            caption=f"Against earlier commands: a residual beyond ±{left.correlation(last).band:.2f}, 99 % of what "
+            "chance does, follows the command in a way that the simulator does not.",
+        )
+    )
+    if left.spectrum(last) is not None:
         pictures.append(
-            small_picture(
-                f"manoeuvre-{i}",
-                drive.manoeuvre_figure(one, traces),
-                f"Lines of a manoeuvre: {name}. {_responses(one)}",
-                Table(name, columns, tuple(rows), numeric=columns[1:]),
-                caption=f"{name}: {100 * one.share:.2g} % of the baseline's squared error. {_responses(one)}",
+            picture_of(
+                "residual-frequency",
+                drive.residual_figure(found, "frequency"),
+                caption="Against frequency: power averaged over windows of 20 s; bands are 90 %.",
             )
         )
-    said = ("Where the baseline simulator errs most, the worst first.",) if pictures else ()
-    return Section(title, said, small=tuple(pictures))
+    return Section(title, _what_is_left(left, both), (_residual_over_time(found, left, both),), tuple(pictures))
 
 
-def _responses(manoeuvre: Manoeuvre) -> str:
-    """Peaks, rises and lags in words."""
-    words = {"measured": "the car", "baseline simulator": "the baseline simulator"}
-    answers = {words.get(name, name): r for name, r in manoeuvre.responses.items() if name != "command"}
-    told = [f"Peak [m/s²]: {', '.join(f'{who} {r.peak:.2f}' for who, r in answers.items())}."]
-    for title, key in (("Rise", "rise"), ("Lag", "lag")):
-        known = [f"{who} {getattr(r, key):.2f}" for who, r in answers.items() if getattr(r, key) is not None]
-        told += [f"{title} [s]: {', '.join(known)}."] if known else []
-    return " ".join(told)
+def _what_is_left(left: Residuals, both: Mapping[str, FloatArray]) -> tuple[str, ...]:
+    what = (
+        "Measured acceleration less that of a rollout over the whole drive"
+        if left.channel == "accel"
+        else "Slope over 1 s of the measured speed less that of a rollout over the whole drive"
+    )
+    sizes = [f"{np.sqrt(np.mean(residual**2)):.2g} m/s² {label}" for label, residual in both.items()]
+    said = [f"{what}: {', '.join(sizes)} (root mean square)."]
+    judged = list(both.values())[-1]
+    shows = [
+        name
+        for name, axis in (("command", left.command), ("speed", left.speed))
+        if axis is not None and _apart(left.against(axis, judged))
+    ]
+    outside = left.correlation(judged)
+    late = outside.lag[(outside.lag >= 0) & (np.abs(outside.value) > outside.band)]
+    who = "The simulator with what was named" if len(both) > 1 else "The baseline simulator"
+    if shows:
+        said.append(f"{who} still errs by more than chance at some {' and some '.join(f'{x}s' for x in shows)}.")
+    if len(late):
+        said.append(f"Its residual still follows commands of {late[0]:.1f} to {late[-1]:.1f} s before.")
+    if not shows and not len(late):
+        said.append("It depends neither on the command, nor on the speed, by more than chance would.")
+    return tuple(said)
+
+
+def _apart(bins: BinnedMeans) -> bool:
+    """Whether more bins than chance would exclude 0: of 90 % intervals, one in ten does."""
+    known = np.isfinite(bins.low)
+    return int(((bins.low > 0) | (bins.high < 0))[known].sum()) > max(2, 0.3 * int(known.sum()))
+
+
+def _residual_over_time(found: Diagnosis, left: Residuals, both: Mapping[str, FloatArray]) -> Picture:
+    columns = ("part of the drive [s]", *(f"{what} {label} [m/s²]" for label in both for what in ("mean", "SD")))
+    rows = [
+        (
+            f"{left.time[part[0]]:.0f} to {left.time[part[-1]]:.0f}",
+            *(f"{size:.3f}" for residual in both.values() for size in (residual[part].mean(), residual[part].std())),
+        )
+        for part in np.array_split(np.arange(len(left.time)), _PARTS)
+    ]
+    judged = list(both.values())[-1]
+    beyond = f"{100 * float(np.mean(np.abs(judged) > left.usual(judged))):.1f} %"
+    return picture_of(
+        "residual-time",
+        lambda narrow: drive.residual_time_figure(found, narrow=narrow),
+        Table("Residual in parts of the drive", columns, tuple(rows), numeric=columns[1:]),
+        caption="Grey ground: where 99 % of a steady normal residual with the quartiles of the last line would lie; "
+        f"{beyond} lie beyond.",
+    )
+
+
+def _residual_against(
+    found: Diagnosis, left: Residuals, both: Mapping[str, FloatArray], name: drive.Against, axis: FloatArray
+) -> Picture:
+    unit = "m/s²" if name == "command" else "m/s"
+    rows = []
+    for label, residual in both.items():
+        bins = left.against(axis, residual)
+        for place, mean, low, high in zip(bins.place, bins.mean, bins.low, bins.high, strict=True):
+            within = f" ({low:.3f} to {high:.3f})" if np.isfinite(low) else ""
+            rows.append((f"{place:.3g} {unit}", label, f"{mean:.3f}{within}"))
+    return picture_of(
+        f"residual-{name}",
+        drive.residual_figure(found, name),
+        Table(f"Mean residual by {name}", (name, "simulator", "mean residual (90 %) [m/s²]"), tuple(rows)),
+        caption=f"Against the {name}: means of as many rows each; bands are 90 %, by blocks of {BLOCK_S:.0f} s.",
+    )

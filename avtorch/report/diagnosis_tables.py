@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from avtorch.gap.engine.family import FORMS
 from avtorch.gap.quantity import Quantity, unit_of, words_of
@@ -12,6 +14,7 @@ from avtorch.gap.result import sentences
 from avtorch.gap.result.budget import UNITS, Budget
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.gap_budget import Shrinkage
+from avtorch.gap.result.manoeuvres import Manoeuvre
 from avtorch.report.table import Table
 
 _METRICS = {
@@ -20,6 +23,8 @@ _METRICS = {
     "log_predictive_density": "log predictive density [nats per row]",
 }
 
+BAND = 0.95
+"""Share of a manoeuvre's rows within a band."""
 _IMPLAUSIBLE = "physically implausible"
 _FAINT = 0.01  # hypotheses less probable than this are only counted
 
@@ -127,6 +132,30 @@ def _place(found: Diagnosis, part: Any) -> tuple[str, str, str, str]:
     else:
         ends = f"{part.begin:.3g} to {part.end:.3g} {UNITS[part.axis]}"
     return part.axis, ends, f"{100 * part.share:.0f} %", "<1e-12" if part.q_value < 1e-12 else f"{part.q_value:.1g}"
+
+
+def manoeuvre_name(found: Diagnosis, one: Manoeuvre) -> str:
+    """Such as: Braking at 26.9 s."""
+    of = f" of drive {one.log + 1}" if len(found.log.epochs_s) > 1 else ""
+    return f"{one.kind.capitalize()} at {one.begin:.1f} s{of}"
+
+
+def manoeuvre_table(found: Diagnosis, each: Sequence[Manoeuvre]) -> Table:
+    """Peak, rise, lag, and the band about the measured acceleration that holds most of a manoeuvre."""
+    columns = ("manoeuvre", "signal", "peak [m/s²]", "rise [s]", "lag [s]", "band [m/s²]")
+    rows = []
+    for one in each:
+        for name, response in one.responses.items():
+            times = ("" if x is None else f"{x:.2f}" for x in (response.rise, response.lag))
+            band = ""
+            if name not in ("command", "measured"):
+                band = f"±{np.quantile(np.abs(one.lines[name] - one.lines['measured']), BAND):.2g}"
+            rows.append((manoeuvre_name(found, one), name, f"{response.peak:.2f}", *times, band))
+    caption = (
+        "Manoeuvres in which the baseline errs most: rise from 10 to 90 %, lag behind the command, and the band that "
+        f"holds {100 * BAND:.0f} % of the rows"
+    )
+    return Table(caption, columns, tuple(rows), numeric=columns[2:])
 
 
 def setting_table(setting: Mapping[str, Any]) -> Table:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from avtorch.errors import InputError
 from avtorch.io.clock import from_start
-from avtorch.plots.time import belief_figure, probability_figure
+from avtorch.plots.time import TARGET, belief_figure, probability_figure
 from avtorch.report.page import Origin, Page, Picture, Section, Tone, picture_of
 from avtorch.report.table import Table
 from avtorch.results import estimates_answer
@@ -18,13 +18,8 @@ if TYPE_CHECKING:
     from avtorch.io import Log
     from avtorch.logcheck.late_channel import LateChannel
 
-TARGET = 0.95
-"""P(string stable) below which a setting is to be changed."""
 
-
-def estimates_html(
-    found: Estimates, log: Log, *, notes: Iterable[str] = (), origin: Origin | None = None, name: str | None = None
-) -> str:
+def estimates_html(found: Estimates, log: Log, *, notes: Iterable[str] = (), origin: Origin | None = None) -> str:
     """The page of the estimate `found` on `log`, as text; `notes`: on the data, beside those of its check.
 
     Raises `InputError` where no window was estimated.
@@ -34,7 +29,7 @@ def estimates_html(
     windows, alerts = (from_start(answer[key], epoch_s) for key in ("windows", "alerts"))
     if not windows:
         raise InputError("found: has no windows, needs the estimate of a log")
-    facts = f"{name or log.name} · {len(windows)} windows of {windows[0]['end_s'] - windows[0]['start_s']:g} s"
+    facts = f"{log.name} · {len(windows)} windows of {windows[0]['end_s'] - windows[0]['start_s']:g} s"
     spread = answer["spread_over_sd"]
     told = (estimates_note(answer), *_stability(windows, answer["assumed"]))
     more = (late_note(found.late), dead_time_note(found.inferred))
@@ -90,33 +85,18 @@ def _tone(windows: Sequence[Mapping[str, Any]], spread_over_sd: Mapping[str, flo
 
 
 def _belief(answer: Mapping[str, Any], log: Log) -> Picture:
-    windows = from_start(answer["windows"], answer["epoch_s"])
-    ends = {
-        n: [f(w[n]["mean"] for w in windows if w["used"] or not any(x["used"] for x in windows)) for f in (min, max)]
-        for n in ("T_L", "K_L")
-    }
-    says = (
-        f"Bands of lag and gain over {windows[-1]['end_s']:.0f} s, 90 % and mean of each window: T_L from "
-        f"{ends['T_L'][0]:.2f} to {ends['T_L'][1]:.2f} s, K_L from {ends['K_L'][0]:.2f} to {ends['K_L'][1]:.2f}. Below "
-        "them: which rows of the log served."
-    )
     return picture_of(
         "belief",
         lambda narrow: belief_figure(answer["windows"], answer=answer, log=log, narrow=narrow),
-        says,
-        window_table(windows),
+        window_table(from_start(answer["windows"], answer["epoch_s"])),
         caption="Grey: a window that excited too little, or did not converge; the belief before it is carried over.",
     )
 
 
 def _probability(answer: Mapping[str, Any]) -> Picture:
-    values = [w["p_string_stable"] for w in answer["windows"]]
-    below = sum(p < TARGET for p in values)
     return picture_of(
         "probability",
-        lambda narrow: probability_figure(answer["windows"], answer=answer, required=TARGET, narrow=narrow),
-        f"P(string stable) over time, {min(values):.2f} to {max(values):.2f}; below {TARGET:g} after {below} of "
-        f"{len(values)} windows.",
+        lambda narrow: probability_figure(answer["windows"], answer=answer, narrow=narrow),
         probability_table(from_start(answer["windows"], answer["epoch_s"])),
         caption="Known at the end of each window: a dot, larger and red below the target.",
     )

@@ -110,7 +110,7 @@ def _ranking(answer: Answer) -> Markup:
     rest = f"The first {PLAIN} of {len(cars)} cars; the others need scripts, or fleet.json."
     return fragment(
         "fleet.html",
-        table=ranking_table(cars[:PLAIN]),
+        table=ranking_table(cars[:PLAIN], links=True),
         kinds=[reason for reason, count in answer["reasons"].items() if count],
         rest=rest if len(cars) > PLAIN else "",
         data=Markup(data),
@@ -179,13 +179,6 @@ def _picture(answer: Answer) -> Picture | None:
     # draws, and needs matplotlib
     from avtorch.plots.fleet import FEW, fleet_figure
 
-    ends = {name: [f(car[name]["mean"] for car in known) for f in (min, max)] for name in ("T_L", "K_L")}
-    below = sum(car["p_string_stable"]["now"] < answer["target"] for car in known)
-    says = (
-        f"{many(len(known), 'car')}: T_L {ends['T_L'][0]:.2f} to {ends['T_L'][1]:.2f} s, "
-        f"K_L {ends['K_L'][0]:.2f} to {ends['K_L'][1]:.2f}. Beside it the share of cars up to each P(string stable): "
-        f"{below} are below the target of {answer['target']:g}."
-    )
     each = "each with its 90 % intervals" if len(known) <= FEW else "a square's area is its number of cars"
     ranks = "; numbers are ranks" if len(known) <= FEW else ""
     caption = (
@@ -193,7 +186,7 @@ def _picture(answer: Answer) -> Picture | None:
         f"blue: the others{ranks}. Second: the share of cars up to each P(string stable)."
     )
     draw = lambda narrow: fleet_figure(answer, narrow=narrow)  # noqa: E731
-    return picture_of("fleet", draw, says, stability_table(answer), caption=caption)
+    return picture_of("fleet", draw, stability_table(answer), caption=caption)
 
 
 def _method(answer: Answer) -> list[str]:
@@ -236,7 +229,7 @@ def ranking_row(car: Answer) -> tuple[str, ...]:
         str(car["rank"]),
         car["reason"],
         "" if stable is None else f"{stable['now']:.3f}",
-        *("" if car[name] is None else _interval(car[name], "mean") for name in ("T_L", "K_L")),
+        *("" if car[name] is None else _interval(car[name]) for name in ("T_L", "K_L")),
         _change(car["change"]),
         _siblings(car["siblings"]),
         lacks,
@@ -244,12 +237,12 @@ def ranking_row(car: Answer) -> tuple[str, ...]:
     )
 
 
-def ranking_table(cars: Sequence[Answer]) -> Table:
-    """A row a car; its name leads to its report, where there is one."""
+def ranking_table(cars: Sequence[Answer], *, links: bool = False) -> Table:
+    """A row a car; with `links` its name leads to its report, where there is one."""
     rows = []
     for car in cars:
         name, *others = ranking_row(car)
-        link = report_of(car)
+        link = report_of(car) if links else ""
         rows.append((Markup('<a href="{}">{}</a>').format(link, printable(name)) if link else name, *others))
     return Table("Ranking of the cars", COLUMNS, tuple(rows), numeric=NUMERIC)
 
@@ -279,9 +272,12 @@ def _small(p: float) -> str:
     return "<1e-12" if p < 1e-12 else f"{p:.2g}"
 
 
-def _interval(q: Mapping[str, float], middle: str) -> str:
-    centre, low, high = (f"{q[key]:.2f}" for key in (middle, "q05", "q95"))
-    return f"{centre} ({low} to {high})"
+def _interval(q: Mapping[str, float], form: str = ".2f") -> str:
+    """A mean, or else a median, and its 90 %; by a `form` that ends with % in per cent."""
+    scale, unit = (100, " %") if form.endswith("%") else (1, "")
+    centre = q["mean"] if "mean" in q else q["median"]
+    middle, low, high = (format(scale * x, form.rstrip("%")) for x in (centre, q["q05"], q["q95"]))
+    return f"{middle}{unit} ({low} to {high})"
 
 
 def population_table(answer: Answer) -> Table:
@@ -291,21 +287,16 @@ def population_table(answer: Answer) -> Table:
     rows = tuple(
         (
             {"T_L": "T_L [s]", "K_L": "K_L"}[name],
-            _interval(common[name]["typical"], "median"),
-            _percent(common[name]["between"]),
+            _interval(common[name]["typical"]),
+            _interval(common[name]["between"], ".3g%"),
             "not told apart: no car has two drives"
             if common[name]["within"] is None
-            else _percent(common[name]["within"]),
+            else _interval(common[name]["within"], ".3g%"),
         )
         for name in _UNITS
         if name in common
     )
     return Table("The model's cars", columns, rows)
-
-
-def _percent(q: Mapping[str, float]) -> str:
-    middle, low, high = (f"{100 * q[key]:.3g}" for key in ("median", "q05", "q95"))
-    return f"{middle} % ({low} to {high})"
 
 
 def cause_table(answer: Answer) -> Table:
@@ -317,7 +308,7 @@ def cause_table(answer: Answer) -> Table:
             one["verdict"],
             f"{one['cars']} of {one['diagnosed']}",
             f"{one['may']} of {one['diagnosed']}",
-            "{:.0f} % ({:.0f} to {:.0f})".format(*(100 * one["share"][key] for key in ("mean", "q05", "q95"))),
+            _interval(one["share"], ".0f%"),
             _some(one["of"] or ()),
         )
         for one in answer["causes"]
@@ -333,7 +324,7 @@ def size_table(answer: Answer) -> Table:
         (
             cause["name"],
             f"{name} [{of['unit']}]",
-            "{:.3g} ({:.3g} to {:.3g})".format(*(of["typical"][key] for key in ("median", "q05", "q95"))),
+            _interval(of["typical"], ".3g"),
             "{:.3g} to {:.3g}".format(*(of["next_car"][key] for key in ("q05", "q95"))),
             str(of["cars"]),
             str(of["drives"]),
@@ -344,9 +335,9 @@ def size_table(answer: Answer) -> Table:
     return Table("How large causes are", columns, rows, numeric=("cars", "drives"))
 
 
-def _some(cars: Sequence[str], most: int = 5) -> str:
-    more = f" and {len(cars) - most} more" if len(cars) > most else ""
-    return ", ".join(cars[:most]) + more
+def _some(cars: Sequence[str]) -> str:
+    more = f" and {len(cars) - 5} more" if len(cars) > 5 else ""
+    return ", ".join(cars[:5]) + more
 
 
 def stability_table(answer: Answer) -> Table:

@@ -109,6 +109,7 @@ _COLOURS = {
 }
 """The style's name for each colour of `avtorch.plots.style`."""
 _PX_A_POINT = 1.5
+_MOST = 40  # rows of a table of lines
 
 
 @dataclass(frozen=True)
@@ -187,20 +188,43 @@ def written(text: str, folder: str | PathLike[str], name: str) -> Path:
 
 def picture_of(
     name: str,
-    draw: Callable[[bool], Figure],
-    says: str,
+    draw: Figure | Callable[[bool], Figure],
     *tables: Table,
+    says: str = "",
     caption: str = "",
     opened: bool = False,
 ) -> Picture:
-    """What `draw` makes of False, for a desk, and of True, for a phone."""
-    wide, narrow = (inline_svg(f"{name}-{kind}", draw(kind == "narrow"), says) for kind in ("wide", "narrow"))
-    return Picture(wide, narrow, says, caption, tables, opened)
+    """What `draw` makes of False, for a desk, and of True, for a phone; or a figure for both, as wide as a phone.
+
+    Where they are not given, what it says and its tables are those of its lines.
+    """
+    # draws, and needs matplotlib
+    from avtorch.plots.style import words_of
+
+    figure = draw(False) if callable(draw) else draw
+    says = says or words_of(figure)
+    wide = inline_svg(f"{name}-wide", figure, says)
+    narrow = inline_svg(f"{name}-narrow", draw(True), says) if callable(draw) else Markup("")
+    return Picture(wide, narrow, says, caption, tables or _tables_of(figure), opened)
 
 
-def small_picture(name: str, figure: Figure, says: str, *tables: Table, caption: str = "") -> Picture:
-    """A figure as wide as a phone, beside another on a desk."""
-    return Picture(inline_svg(name, figure, says), Markup(""), says, caption, tables)
+def _tables_of(figure: Figure) -> tuple[Table, ...]:
+    """The lines of each axes, which have their places in common: at `_MOST` of these, evenly spaced."""
+    from avtorch.plots.style import lines_of
+
+    tables = []
+    # axes beside or above each other share a label
+    along = next(text for ax in reversed(figure.axes) if (text := ax.get_xlabel()))
+    across = next(text for ax in figure.axes if (text := ax.get_ylabel()))
+    for ax in figure.axes:
+        lines = lines_of(ax)
+        if lines:
+            columns = (ax.get_xlabel() or along, *lines)
+            points = [next(iter(lines.values()))[:, 0], *(values[:, 1] for values in lines.values())]
+            some = list(zip(*points, strict=True))[:: -(-len(points[0]) // _MOST)]
+            rows = tuple((f"{x:.4g}", *(f"{y:.3g}" for y in ys)) for x, *ys in some)
+            tables.append(Table(f"{ax.get_ylabel() or across} over {columns[0]}", columns, rows, numeric=columns))
+    return tuple(tables)
 
 
 def inline_svg(name: str, figure: Figure, says: str) -> Markup:

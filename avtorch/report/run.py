@@ -12,11 +12,10 @@ from numpy.typing import ArrayLike
 
 from avtorch.arrays import FloatArray
 from avtorch.plots.plane import loop_of, region_figure
-from avtorch.plots.style import LABELS
-from avtorch.plots.time import Motion, Steps, begun, motion_figure, overview_figure
+from avtorch.plots.time import TARGET, Motion, Steps, begun, motion_figure, overview_figure
 from avtorch.report.estimates import window_table
 from avtorch.report.page import Origin, Page, Picture, Section, picture_of
-from avtorch.report.table import Table, of_numbers
+from avtorch.report.table import Table
 from avtorch.results import MEASURES
 from avtorch.vehicle import stability
 
@@ -27,7 +26,6 @@ _STRATEGIES = {
     4: "the leader's acceleration fed forward",
 }
 _MOST = 40  # rows of the story
-_ROWS = 50  # of the table behind the motion
 _DOTS, _POINTS = 150, 301  # draws of a cloud, points of a map's axis: more would make a page of megabytes
 
 
@@ -59,19 +57,11 @@ def run_html(
     overview = picture_of(
         "overview",
         lambda narrow: overview_figure(answer, time, traces, truth=truth, bounds=bounds, narrow=narrow),
-        f"Four lines over time: acceleration, the belief about lag and about gain, and P(string stable), which "
-        f"{_at_the_end(answer)}.",
         window_table(answer["windows"]),
         caption="Blue: avtorch's belief, or the run with its actions. Dashed: the truth. Hatched: the bounds the "
         "controller was designed for.",
     )
-    motion = picture_of(
-        "motion",
-        lambda narrow: motion_figure(answer, time, traces, narrow=narrow),
-        f"Lines over time of {', '.join(LABELS[quantity] for quantity in traces)}: "
-        f"{', '.join(dict.fromkeys(n for q in traces.values() for n in q))}.",
-        _motion_table(time, traces),
-    )
+    motion = picture_of("motion", lambda narrow: motion_figure(answer, time, traces, narrow=narrow))
     story = story_table(answer)
     more = 1 + len(begun(answer)) + len(answer["actions"]) - len(story.rows)
     page = Page(
@@ -92,7 +82,7 @@ def run_html(
                 ),
             ),
         ),
-        "green" if answer["windows"][-1]["p_string_stable"] >= 0.95 else "amber",
+        "green" if answer["windows"][-1]["p_string_stable"] >= TARGET else "amber",
     )
     return page.html(origin)
 
@@ -159,25 +149,12 @@ def performance_table(answer: Mapping[str, Any]) -> Table:
     return Table(caption, columns, rows, numeric=columns[1:])
 
 
-def _motion_table(time: ArrayLike, traces: Motion) -> Table:
-    """The lines of the motion at `_ROWS` times at most."""
-    lines = {
-        f"{name}: {LABELS[quantity]}": np.asarray(values)
-        for quantity, named in traces.items()
-        for name, values in named.items()
-    }
-    some = np.column_stack([np.asarray(time), *lines.values()])
-    # evenly spaced from the first row on, so that the times are round
-    some = some[:: -(-len(some) // _ROWS)]
-    return of_numbers("The motion", ("time [s]", *lines), some.tolist(), (".1f", *(".2f" for _ in lines)))
-
-
 def _number(value: float | None) -> str:
     return "none" if value is None else f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
 
 
-def story_table(answer: Mapping[str, Any], most: int = _MOST) -> Table:
-    """The change, alerts and actions in order, `most` of them."""
+def story_table(answer: Mapping[str, Any]) -> Table:
+    """The change, alerts and actions in order, the first of them."""
     change = answer["change"]
     lines = [
         (change["time_s"], "change", f"the vehicle changes to T_L {change['T_L']:g} s, K_L {change['K_L']:g}"),
@@ -189,7 +166,7 @@ def story_table(answer: Mapping[str, Any], most: int = _MOST) -> Table:
         gain = "" if a["peak_gain_true"] is None else f"; true peak gain {a['peak_gain_true']:.4f}"
         lines.append((a["time_s"], "action", f"{_means(a)}: {a['why']}{gain}"))
     # the sort is stable: an action stays behind the alert of the same time that it answers
-    rows = tuple((f"{time:.1f}", kind, text) for time, kind, text in sorted(lines, key=lambda line: line[0])[:most])
+    rows = tuple((f"{time:.1f}", kind, text) for time, kind, text in sorted(lines, key=lambda line: line[0])[:_MOST])
     return Table("Events in order", ("time [s]", "what", "why"), rows)
 
 
@@ -197,13 +174,10 @@ def _regions(regions: Regions | None, truth: Mapping[str, Steps] | None) -> tupl
     if regions is None:
         return ()
     now = None if truth is None else (float(truth["T_L"][-1][1]), float(truth["K_L"][-1][1]))
-    names = ", ".join(name for name, _ in regions.settings)
     clouds = {name: (np.asarray(T)[:_DOTS], np.asarray(K)[:_DOTS]) for name, (T, K) in regions.clouds.items()}
     drawn = picture_of(
         "region",
         lambda narrow: region_figure(regions.settings, clouds, truth=now, narrow=narrow, points=_POINTS),
-        f"Maps over lag and gain of where the loop is locally and string stable, one for each setting ({names}), with "
-        f"{' and '.join(regions.clouds)}.",
         _shares(regions, now),
         caption="A dot is a draw of the belief. String stable is what lies in the blue.",
     )

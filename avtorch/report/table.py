@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from avtorch.errors import InputError
@@ -30,11 +30,3 @@ class Table:
                 raise InputError(
                     f"table {self.caption!r}: found {len(row)} cells in row {i}, needs {len(self.columns)}"
                 )
-
-
-def of_numbers(
-    caption: str, columns: Sequence[str], values: Iterable[Sequence[float]], formats: Sequence[str]
-) -> Table:
-    """A table of numbers alone: `values` (row, column), each column written by its format."""
-    rows = tuple(tuple(format(x, f) for x, f in zip(row, formats, strict=True)) for row in values)
-    return Table(caption, tuple(columns), rows, numeric=tuple(columns))

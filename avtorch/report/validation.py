@@ -10,31 +10,14 @@ from scipy.stats import ks_2samp, kstest
 
 from avtorch.inference.arviz_export import shown_unit
 from avtorch.plots.posteriors import ChosenWindows, validation_figures
-from avtorch.report.page import Origin, Page, Picture, Section, picture_of
+from avtorch.report.page import Origin, Page, Section, picture_of
 from avtorch.report.table import Table
 from avtorch.results import validation_answer
 from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE
 from avtorch.validation.validate import Validation
 
 _MOST = 40  # rows of the table behind a picture of all windows
-_TITLES = {
-    "agreement": "Window by window",
-    "marginals": "Marginals",
-    "joint": "Lag and gain together",
-    "ranks": "Ranks",
-    "ecdf": "Exact probabilities below the draws",
-}
-"""Of the sections, by picture, in their order."""
 _REFERENCES = {"nuts": "NUTS", "quadrature": "exact quadrature"}
-_SAYS = {
-    "agreement": "Dots, one a window: how far SGLD's mean and SD are from the reference's, over the width of the "
-    "posterior, with the limits asked for.",
-    "marginals": "Exact densities of each parameter with histograms of the draws of SGLD and of NUTS.",
-    "joint": "Clouds of SGLD's draws of lag and gain within the 50 and 90 % regions of the references.",
-    "ranks": "Bars of the ranks of groups of chains in the pool of all draws, as many as are effective.",
-    "ecdf": "Lines of the share of draws below each exact probability, less what it should be, with the band that "
-    "chance explains.",
-}
 
 
 def validation_html(found: Validation, *, origin: Origin | None = None) -> str:
@@ -52,25 +35,33 @@ def validation_html(found: Validation, *, origin: Origin | None = None) -> str:
             tables=(validation_table(answer),),
             items=validation_notes(answer),
         ),
-        tuple(Section(_TITLES[name], pictures=(picture,)) for name, picture in _pictures(found).items()),
+        _sections(found),
         "green" if found.verdict.agree else "amber",
     )
     return page.html(origin)
 
 
-def _pictures(found: Validation) -> dict[str, Picture]:
-    by_width = {narrow: validation_figures(found, narrow=narrow) for narrow in (False, True)}
-    tables = _tables_behind(found)
-    return {
-        name: picture_of(
-            name,
-            lambda narrow, name=name: by_width[narrow][f"{name}.png"](),
-            _SAYS[name],
-            tables[name],
-        )
-        for name in _TITLES
-        if f"{name}.png" in by_width[False]
+def _sections(found: Validation) -> list[Section]:
+    """A picture each, with its table; the exact probabilities only where there is quadrature."""
+    wide, phone = (validation_figures(found, narrow=narrow) for narrow in (False, True))
+    chosen = ChosenWindows(found)
+    parts = {
+        "agreement": ("Window by window", _windows),
+        "marginals": ("Marginals", _marginals),
+        "joint": ("Lag and gain together", _correlations),
+        "ranks": ("Ranks", _ranks),
+        "ecdf": ("Exact probabilities below the draws", _ecdfs),
     }
+    return [
+        Section(
+            title,
+            pictures=(
+                picture_of(name, lambda narrow, f=f"{name}.png": (phone if narrow else wide)[f](), table(chosen)),
+            ),
+        )
+        for name, (title, table) in parts.items()
+        if f"{name}.png" in wide
+    ]
 
 
 def validation_table(answer: Mapping[str, Any]) -> Table:
@@ -114,22 +105,9 @@ def validation_notes(answer: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 # behind the pictures ------------------------------------------------------------------------------------------------
-def _tables_behind(found: Validation) -> dict[str, Table]:
-    """By picture; the one of exact probabilities only where there is quadrature."""
-    chosen = ChosenWindows(found)
-    tables = {
-        "agreement": _windows(found),
-        "marginals": _marginals(chosen),
-        "joint": _correlations(chosen),
-        "ranks": _ranks(chosen),
-    }
-    if found.quadrature is not None:
-        tables["ecdf"] = _ecdfs(chosen)
-    return tables
-
-
-def _windows(found: Validation) -> Table:
+def _windows(chosen: ChosenWindows) -> Table:
     """The windows farthest from the reference first, `_MOST` of them at most."""
+    found = chosen.validation
     columns = ("window", *(f"{what}, {n}" for what in ("mean error [SD]", "SD ratio") for n in found.names))
     errors, ratios = (x.numpy() for x in (found.agreement.mean_difference, found.agreement.sd_ratio))
     far = np.nan_to_num(np.maximum(abs(errors) / MEAN_TOLERANCE, abs(ratios - 1) / SD_TOLERANCE), nan=np.inf).max(1)

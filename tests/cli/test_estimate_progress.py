@@ -1,53 +1,10 @@
-"""`avtorch estimate` while it works: windows on the disk as they are done, and progress in lines."""
+"""`avtorch estimate` while it works: progress in lines."""
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import pytest
 
-from avtorch import GLVDPlant, Leader, estimate, simulate
-from avtorch.cli.estimate import LINES as NAME
-from avtorch.cli.estimate import finished_windows
 from avtorch.display import progress
-from avtorch.errors import InputError
-from avtorch.results import window_entry
-
-
-def test_windows_are_on_the_disk_as_they_are_done_and_gone_with_the_answer(tmp_path: Path) -> None:
-    run = simulate(Leader.default(start=50.0, duration=6.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-    path, seen = tmp_path / NAME, []
-    with finished_windows(tmp_path) as write:
-
-        def one(window):
-            write(window)
-            seen.append(len(path.read_text(encoding="utf-8").splitlines()))
-
-        found = estimate(run.log(), estimator="map", finished=one)
-        lines = path.read_text(encoding="utf-8").splitlines()
-    assert seen == [1, 2, 3]
-    assert [json.loads(line) for line in lines] == [window_entry(w) for w in found.windows]
-    assert not path.exists()
-
-
-def test_an_interruption_leaves_the_windows_done_so_far(tmp_path: Path) -> None:
-    run = simulate(Leader.default(start=50.0, duration=6.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-
-    def stop(window):
-        write(window)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt), finished_windows(tmp_path) as write:
-        estimate(run.log(), estimator="map", finished=stop)
-    assert len((tmp_path / NAME).read_text(encoding="utf-8").splitlines()) == 1
-
-
-def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) -> None:
-    (tmp_path / NAME).mkdir()
-    run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
-    with pytest.raises(InputError, match=NAME), finished_windows(tmp_path) as write:
-        estimate(run.log(), estimator="map", finished=write)
 
 
 def lines(title: str, calls: list[tuple], times: list[float], monkeypatch: pytest.MonkeyPatch) -> list[str]:

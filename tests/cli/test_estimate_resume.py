@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-import avtorch.results
 from avtorch.cli import main
-from avtorch.cli.estimate import LINES as NAME
 from avtorch.cli.estimate import STATE as WINDOWS
 from avtorch.decision import estimation
 from avtorch.io import Log
@@ -37,23 +37,28 @@ def answer(out: Path) -> dict[str, Any]:
     return found
 
 
+def with_each_window(call: Callable[[object], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command calls this, too, as a window is done."""
+    work = avtorch.decision.estimation.estimate
+    monkeypatch.setattr(avtorch.decision.estimation, "estimate", partial(work, finished=call))
+
+
 @pytest.fixture
 def interrupted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> tuple[list[str], Path]:
     """A command that was interrupted at its sixth window, and its folder."""
     line = ["estimate", two_segments(tmp_path / "drive.csv"), "--quiet", "--dead-time", "0"]
-    out, count, entry = tmp_path / "out", 0, avtorch.results.window_entry
+    out, count = tmp_path / "out", 0
 
-    def stop(*args: Any) -> dict[str, Any]:
+    def stop(_: object) -> None:
         nonlocal count
         count += 1
         if count == 6:
             raise KeyboardInterrupt
-        return entry(*args)
 
     with monkeypatch.context() as until:
-        until.setattr(avtorch.results, "window_entry", stop)
+        with_each_window(stop, until)
         assert main([*line, "--out", str(out)]) == 130
     told = capsys.readouterr().err
     assert told.count("\n") == 1
@@ -64,15 +69,12 @@ def interrupted(
 
 def test_the_same_command_goes_on_to_the_same_answer(interrupted: tuple[list[str], Path], tmp_path: Path) -> None:
     line, out = interrupted
-    with (out / NAME).open("a", encoding="utf-8") as torn:  # killed in the middle of a line
-        torn.write('{"start_s": 10.0, "end_')
     assert main([*line, "--out", str(out)]) == 0
     assert main([*line, "--out", str(tmp_path / "whole")]) == 0
     assert answer(out) == answer(tmp_path / "whole")
     used = [w["used"] for w in answer(out)["windows"]]
     assert sum(used) > 5, "the belief has to be carried over the interruption"
     assert not (out / WINDOWS).exists()
-    assert not (out / NAME).exists()
 
 
 @pytest.mark.slow
@@ -93,17 +95,16 @@ def test_windows_done_before_are_not_computed_again(
 def test_a_killed_run_goes_on_from_what_was_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     line = ["estimate", two_segments(tmp_path / "drive.csv"), "--quiet", "--dead-time", "0"]
     monkeypatch.setattr(estimation, "EVERY_S", 0.0)
-    out, killed, seen, entry = tmp_path / "out", tmp_path / "killed", [], avtorch.results.window_entry
+    out, killed, seen = tmp_path / "out", tmp_path / "killed", []
 
-    def copied(*args: Any) -> dict[str, Any]:
-        seen.append(args)
+    def copied(window: object) -> None:
+        seen.append(window)
         if len(seen) == 3:
             killed.mkdir()
             shutil.copy(out / WINDOWS, killed)
-        return entry(*args)
 
     with monkeypatch.context() as until:
-        until.setattr(avtorch.results, "window_entry", copied)
+        with_each_window(copied, until)
         assert main([*line, "--out", str(out)]) == 0
     assert main([*line, "--out", str(killed)]) == 0
     assert answer(killed) == answer(out)

@@ -64,7 +64,7 @@ def test_it_says_which_cars_whose_causes_and_what_failed(text: str, page: Elemen
     )
     (svg, other) = page.all("svg")
     assert svg.attributes["aria-label"] == other.attributes["aria-label"]
-    assert "9 are below the target" in svg.attributes["aria-label"]
+    assert "P(string stable)" in svg.attributes["aria-label"]
 
 
 def test_a_hostile_name_is_text_in_html_and_in_the_data(text: str, page: Element) -> None:
