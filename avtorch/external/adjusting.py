@@ -217,15 +217,13 @@ Values = Mapping[str, float]
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """The simulator's `outputs` by drive with the values that fit the car.
-
-    `parameters`: what it had, and what the car has; they differ where the evidence says that other values are
-    needed. `rollouts`: how many times the car's drives were driven through.
+    """`parameters`: what the simulator has, and what the car has; they differ where the evidence says that other values
+    are needed. `outputs`: the simulator's by drive, with the car's values where they differ. `rollouts`: those made.
     """
 
     outputs: tuple[Log, ...]
     parameters: tuple[ParameterDifference, ...]
-    rollouts: int
+    rollouts: Rollouts
 
     @property
     def wrong(self) -> bool:
@@ -293,13 +291,13 @@ def adjusted(rollouts: Rollouts, limits: Limits, *, logs: Sequence[Log] | None =
             break
         fit = LinearFit.of(_around(data, rollouts, ranges, ranges.values(fit.z)))
     values = ranges.values(fit.z)
-    outputs = rollouts.at(values)
+    better = rollouts.at(values)
     needed = fit.evidence_over(plain) > EFFECT_NATS
     errors = dict(zip(limits, (fit.errors * ranges.scales).tolist(), strict=True))
     found = tuple(
         _difference(name, before[name], values[name], errors[name], data.frame_count - 1, needed) for name in limits
     )
-    return Adjusted(outputs, found, len(rollouts))
+    return Adjusted(better if any(p.differs for p in found) else first, found, rollouts)
 
 
 def _difference(name: str, before: float, value: float, sd: float, freedom: int, needed: bool) -> ParameterDifference:
