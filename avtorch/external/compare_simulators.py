@@ -20,7 +20,7 @@ it does to the logarithm of the error. So the factors of all differences multipl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from math import factorial
@@ -35,7 +35,7 @@ from avtorch.arrays import FloatArray
 from avtorch.display import Card, Displayed, Frame
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.external.external_simulator import ExternalSimulator
+from avtorch.external.external_simulator import ExternalSimulator, Progress
 from avtorch.external.simulator import DrivenPlant
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.compare import LEVEL
@@ -338,7 +338,6 @@ def _alike(one: dict[str, float] | None, two: dict[str, float] | None) -> bool:
     return all(np.isclose(one[key], two[key], rtol=_SAME, atol=0.0) for key in one)
 
 
-Progress = Callable[[str, int, int], None]
 _CHANNELS = ("accel", "speed")
 
 

@@ -24,8 +24,8 @@ from scipy.integrate import trapezoid
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
 from avtorch.external.adjusting import Adjusted, Rollouts, adjusted, fewest_rollouts
-from avtorch.external.driving import Values, aligned, driven_along, in_drives, side_by_side
-from avtorch.external.simulator import Limits, Simulator, check_methods, values_of, with_values
+from avtorch.external.driving import aligned, driven_along, in_drives, side_by_side
+from avtorch.external.simulator import Limits, Simulator, Values, check_methods, values_of, with_values
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
