@@ -269,7 +269,7 @@ class SimulatorCheck(Displayed):
         lines = [f"{self.name} answers as"]
         for name, value in self.values.items():
             effect, _, key = name.rpartition(".")
-            unit = {"T_L": "s", "K_L": "-"}.get(key) if not effect else unit_of(key)
+            unit = unit_of(key)
             words = f"{effect}: {words_of(key)}" if effect else {"T_L": "lag T_L", "K_L": "gain K_L"}[key]
             lines.append(f"  {words} {value:.3g}{'' if unit == '-' else f' {unit}'}")
         return "\n".join([*lines, f"and that is all but {100 * self.left:.1f} % of its response."])
