@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -165,7 +164,7 @@ class SimulatorBesideCar:
     rollout: dict[str, float]
     fitted: Adjusted | None = None
 
-    @cached_property
+    @property
     def logs(self) -> tuple[Log, ...]:
         """The car's, less what the simulator does beyond its surrogate."""
         cars = [replace(log, engaged=out.engaged) for log, out in zip(self.cars, self.outputs, strict=True)]
