@@ -14,7 +14,7 @@ needed at all is decided as it is for effects, by evidence, and at their price (
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -24,7 +24,7 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError, listed
-from avtorch.external.simulator import Limits
+from avtorch.external.simulator import Limits, Values
 from avtorch.gap.engine.compiled_plant import read_late
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import normal_prior
@@ -198,34 +198,21 @@ class LinearFit:
         return np.sqrt(np.maximum(np.diag(sandwich), np.diag(inverse)))[:n]
 
 
-def rows_of(data: DriveData, signals: Sequence[FloatArray]) -> FloatArray:
-    """Rows (row,) of the data from signals (time,), one for each log."""
-    out = np.empty(len(data.time))
-    for number, signal in enumerate(signals):
-        own = data.log == number
-        out[own] = signal[data.source[own, None] + np.arange(data.group)].mean(1)
-    return out
-
-
 _ROUNDS = 4  # of linearising
 _BESIDE = 0.02  # of a parameter's range: where the simulator is driven beside its value
 _STAYS = 0.02  # prior standard deviations, a hundredth of the range
 _SURELY = 0.95  # of an interval that does not hold the present value
 
-Values = Mapping[str, float]
-
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """The simulator's `outputs` by drive with the values that fit the car.
-
-    `parameters`: what it had, and what the car has; they differ where the evidence says that other values are
-    needed. `rollouts`: how many times the car's drives were driven through.
+    """`parameters`: what the simulator has, and what the car has; they differ where the evidence says that other values
+    are needed. `outputs`: the simulator's by drive, with the car's values where they differ. `rollouts`: those made.
     """
 
     outputs: tuple[Log, ...]
     parameters: tuple[ParameterDifference, ...]
-    rollouts: int
+    rollouts: Rollouts
 
     @property
     def wrong(self) -> bool:
@@ -293,13 +280,13 @@ def adjusted(rollouts: Rollouts, limits: Limits, *, logs: Sequence[Log] | None =
             break
         fit = LinearFit.of(_around(data, rollouts, ranges, ranges.values(fit.z)))
     values = ranges.values(fit.z)
-    outputs = rollouts.at(values)
+    better = rollouts.at(values)
     needed = fit.evidence_over(plain) > EFFECT_NATS
     errors = dict(zip(limits, (fit.errors * ranges.scales).tolist(), strict=True))
     found = tuple(
         _difference(name, before[name], values[name], errors[name], data.frame_count - 1, needed) for name in limits
     )
-    return Adjusted(outputs, found, len(rollouts))
+    return Adjusted(better if any(p.differs for p in found) else first, found, rollouts)
 
 
 def _difference(name: str, before: float, value: float, sd: float, freedom: int, needed: bool) -> ParameterDifference:
@@ -355,11 +342,11 @@ def _none(data: DriveData) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def _readings(data: DriveData, outputs: Sequence[Log]) -> FloatArray:
     """The outputs as readings (channel, row) of the car's channels."""
-    return np.array([rows_of(data, [_channel(out, name) for out in outputs]) for name in data.channels])
-
-
-def _channel(output: Log, name: str) -> FloatArray:
-    found = getattr(output, name)
-    if found is None:
-        raise InputError(f"{output.name}: has no {name}, needs the channels of the car's log")
-    return found
+    out = np.empty((data.channel_count, len(data.time)))
+    for channel, name in enumerate(data.channels):
+        for number, output in enumerate(outputs):
+            signal, own = getattr(output, name), data.log == number
+            if signal is None:
+                raise InputError(f"{output.name}: has no {name}, needs the channels of the car's log")
+            out[channel, own] = signal[data.source[own, None] + np.arange(data.group)].mean(1)
+    return out

@@ -20,7 +20,7 @@ it does to the logarithm of the error. So the factors of all differences multipl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from math import factorial
@@ -35,7 +35,7 @@ from avtorch.arrays import FloatArray
 from avtorch.display import Card, Displayed, Frame
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.external.external_simulator import ExternalSimulator
+from avtorch.external.external_simulator import ExternalSimulator, Progress
 from avtorch.external.simulator import DrivenPlant
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.compare import LEVEL
@@ -193,15 +193,6 @@ class LogRatio:
     mean: float
     by_block: FloatArray
 
-    def __add__(self, other: LogRatio) -> LogRatio:
-        return LogRatio(self.mean + other.mean, self.by_block + other.by_block)
-
-    def __sub__(self, other: LogRatio) -> LogRatio:
-        return self + -1.0 * other
-
-    def __rmul__(self, factor: float) -> LogRatio:
-        return LogRatio(factor * self.mean, factor * self.by_block)
-
     @property
     def sd(self) -> float:
         """Standard deviation, by the spread between blocks."""
@@ -270,18 +261,19 @@ _MOST = 6  # differences told one by one; those that do less alone are told toge
 
 
 def differences(
-    scored: ScoredBlocks, chains: Sequence[GapPlant], far: int, errors: FloatArray
+    scored: ScoredBlocks, surrogates: Sequence[Surrogate], far: int, errors: FloatArray
 ) -> tuple[Difference, ...]:
-    """What the `chains` of two simulators have differently, that which most brings number `far` nearer first.
+    """What the `surrogates` of two simulators have differently, that which most brings number `far` nearer first.
 
     `errors` (channel, counted, group): those of the simulator `far`.
     """
+    chains = [surrogate.plant for surrogate in surrogates]
     base, donor = chains[far], chains[1 - far]
     own = rolled_out(scored.record, base)
-    sides = {name: [_values(chain, name) for chain in chains] for name in _parts(chains)}
+    sides = {name: [_values(surrogate, name) for surrogate in surrogates] for name in _parts(chains)}
     apart = [name for name, (one, two) in sides.items() if not _alike(one, two)]
     known: dict[frozenset[str], LogRatio] = {}
-    before = scored.squares(errors, float(base.T_L))
+    as_it_is = scored.squares(errors, float(base.T_L))
 
     def with_parts(names: frozenset[str]) -> LogRatio:
         """Of the error with these parts as in the other one to what it is."""
@@ -290,7 +282,7 @@ def differences(
             for name in sorted(names):
                 changed = _with_part(changed, donor, name)
             moved = errors + own - rolled_out(scored.record, changed) if names else errors
-            known[names] = scored.log_ratio(before, scored.squares(moved, float(changed.T_L)))
+            known[names] = scored.log_ratio(as_it_is, scored.squares(moved, float(changed.T_L)))
         return known[names]
 
     alone = sorted(apart, key=lambda name: -abs(with_parts(frozenset((name,))).mean))
@@ -300,14 +292,16 @@ def differences(
     found = []
     for name, own_parts in groups.items():
         others = [group for other, group in groups.items() if other != name]
-        share = LogRatio(0.0, np.zeros(len(scored.blocks)))
+        mean, by_block = 0.0, np.zeros(len(scored.blocks))
         for count in range(len(others) + 1):
             weight = factorial(count) * factorial(len(others) - count) / factorial(len(others) + 1)
             for chosen in combinations(others, count):
                 there = frozenset().union(*chosen)
-                share += weight * (with_parts(there | own_parts) - with_parts(there))
+                after, before = with_parts(there | own_parts), with_parts(there)
+                mean += weight * (after.mean - before.mean)
+                by_block += weight * (after.by_block - before.by_block)
         one, two = sides.get(name, (None, None))
-        found.append(Difference(name, one, two, share.ratio, tuple(sorted(own_parts))))
+        found.append(Difference(name, one, two, LogRatio(mean, by_block).ratio, tuple(sorted(own_parts))))
     return tuple(sorted(found, key=lambda difference: difference.ratio.mean))
 
 
@@ -332,11 +326,10 @@ def _with_part(base: GapPlant, donor: GapPlant, name: str) -> GapPlant:
     return GapPlant([*kept, *given], T_L=lag.T_L, K_L=base.K_L, sigma=base.sigma)
 
 
-def _values(chain: GapPlant, name: str) -> dict[str, float] | None:
+def _values(surrogate: Surrogate, name: str) -> dict[str, float] | None:
     if name in ("T_L", "K_L"):
-        return {name: float(getattr(chain, name))}
-    report = chain.report()
-    return None if name not in report else {k: float(x) for k, x in report[name].items() if x.dim() == 0}
+        return {name: float(getattr(surrogate.plant, name))}
+    return surrogate.sizes().get(name)
 
 
 def _alike(one: dict[str, float] | None, two: dict[str, float] | None) -> bool:
@@ -345,7 +338,6 @@ def _alike(one: dict[str, float] | None, two: dict[str, float] | None) -> bool:
     return all(np.isclose(one[key], two[key], rtol=_SAME, atol=0.0) for key in one)
 
 
-Progress = Callable[[str, int, int], None]
 _CHANNELS = ("accel", "speed")
 
 
@@ -406,7 +398,6 @@ def compare_simulators(
     one, two = (scored.squares(e, lag) for e, lag in zip(errors, lags, strict=True))
     both = scored.log_ratio(one, two)
     far = 0 if both.mean < 0 else 1
-    chains = [surrogate.plant for surrogate in surrogates]
     told = [
         _told(simulator, surrogate, offsets, is_plant=own is not None)
         for (simulator, own), surrogate, (_, offsets) in zip(given, surrogates, rolled, strict=True)
@@ -429,7 +420,7 @@ def compare_simulators(
         level=level,
         blocks=len(scored.blocks),
         horizon_s=scored.horizon_s,
-        differences=differences(scored, chains, far, errors[far]),
+        differences=differences(scored, surrogates, far, errors[far]),
     )
 
 

@@ -14,7 +14,7 @@ import math
 import multiprocessing
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -27,7 +27,7 @@ import numpy as np
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError, quoted
 from avtorch.external.fmu import FmuSimulator
-from avtorch.external.simulator import Simulator, WholeDrives
+from avtorch.external.simulator import Simulator, Values, WholeDrives
 from avtorch.io import Log
 
 
@@ -265,7 +265,6 @@ def _check_commands(simulated: Log, log: Log, time: FloatArray, rows: BoolArray)
 
 
 Answer = TypeVar("Answer")
-Values = Mapping[str, float]
 _copied: tuple[Simulator, Callable[[Simulator, Values], Any]] | None = None
 """What a copy of this process drives."""
 

@@ -23,8 +23,8 @@ from scipy.integrate import trapezoid
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
 from avtorch.external.adjusting import Adjusted, Rollouts, adjusted, fewest_rollouts
-from avtorch.external.driving import Values, aligned, driven_along, in_drives, side_by_side
-from avtorch.external.simulator import Limits, Simulator, check_methods, values_of, with_values
+from avtorch.external.driving import aligned, driven_along, in_drives, side_by_side
+from avtorch.external.simulator import Limits, Simulator, Values, check_methods, values_of, with_values
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
@@ -106,13 +106,13 @@ class ExternalSimulator:
         """
         if not self.adjustable:
             outputs, offsets = self.outputs(logs, progress)
-            return _beside(self, logs, outputs, offsets, rollout_errors(logs, outputs), None, None, progress)
+            surrogate = surrogate_of(outputs, progress=progress)
+            return SimulatorBesideCar(self, logs, outputs, surrogate, offsets, rollout_errors(logs, outputs))
         rollouts = self._rollouts(logs, progress)
-        first = rollouts.at(rollouts.start)
         fitted = adjusted(rollouts, self.adjustable)
-        outputs = fitted.outputs if fitted.wrong else first
-        offsets = (0.0,) * len(logs)
-        return _beside(self, logs, outputs, offsets, rollout_errors(logs, first), rollouts, fitted, progress)
+        errors = rollout_errors(logs, rollouts.at(rollouts.start))
+        surrogate = surrogate_of(fitted.outputs, progress=progress)
+        return SimulatorBesideCar(self, logs, fitted.outputs, surrogate, (0.0,) * len(logs), errors, fitted)
 
     def outputs(
         self, logs: Sequence[Log], progress: Progress | None = None
@@ -139,8 +139,6 @@ class ExternalSimulator:
             return self._driven(with_values(own, values), logs)
 
         def drive(places: Sequence[Values]) -> list[tuple[Log, ...]]:
-            if not len(rollouts) and len(places) == 1:
-                return [self._driven(simulator, logs, progress)]
             if progress is not None:
                 many = f"{len(rollouts) + len(places)} of {self.most_rollouts} at most"
                 progress(f"fitting its parameters, drive {many}", len(rollouts), self.most_rollouts)
@@ -154,18 +152,23 @@ class ExternalSimulator:
 class SimulatorBesideCar:
     """A diagnosis against `simulator`: that of `logs` with `plant` as its baseline.
 
-    `outputs`: the simulator's. `logs`: the car's, less what the simulator does beyond its surrogate. `fitted`: its own
-    parameters fitted to the car, where it may adjust any.
+    `cars`: the car's logs. `outputs`: the simulator's. `rollout`: its errors, before anything is fitted. `fitted`: its
+    own parameters fitted to the car, where it may adjust any.
     """
 
     simulator: ExternalSimulator
-    surrogate: Surrogate
+    cars: Sequence[Log]
     outputs: tuple[Log, ...]
-    logs: tuple[Log, ...]
+    surrogate: Surrogate
     offsets: tuple[float, ...]
     rollout: dict[str, float]
-    rollouts: Rollouts | None = None
     fitted: Adjusted | None = None
+
+    @property
+    def logs(self) -> tuple[Log, ...]:
+        """The car's, less what the simulator does beyond its surrogate."""
+        cars = [replace(log, engaged=out.engaged) for log, out in zip(self.cars, self.outputs, strict=True)]
+        return tuple(without_discrepancy(log, out, self.plant) for log, out in zip(cars, self.outputs, strict=True))
 
     @property
     def plant(self) -> GapPlant:
@@ -178,15 +181,12 @@ class SimulatorBesideCar:
         if self.fitted is None or out.tested is None or found.plant is None or not out.tested.missing:
             return out
         # without what is missing its parameters stood in for that
-        assert self.rollouts is not None
         missing = set(out.tested.missing)
         rest = [effect for effect in found.plant.effects if effect.name not in missing]
         bare = GapPlant(rest, T_L=found.plant.T_L, K_L=found.plant.K_L, sigma=0.0)
-        logs = self.rollouts.logs
-        cars = [_without(*each, found.plant, bare) for each in zip(logs, self.outputs, strict=True)]
-        fitted = adjusted(self.rollouts, self.simulator.adjustable, logs=cars)
-        outputs = fitted.outputs if fitted.wrong else self.rollouts.at(self.rollouts.start)
-        again = _beside(self.simulator, logs, outputs, self.offsets, self.rollout, self.rollouts, fitted)
+        cars = [_without(*each, found.plant, bare) for each in zip(self.cars, self.outputs, strict=True)]
+        fitted = adjusted(self.fitted.rollouts, self.simulator.adjustable, logs=cars)
+        again = replace(self, outputs=fitted.outputs, surrogate=surrogate_of(fitted.outputs), fitted=fitted)
         return again._told(found)
 
     def _told(self, found: Diagnosis) -> Diagnosis:
@@ -218,7 +218,7 @@ class SimulatorBesideCar:
             self.rollout,
             tuple(differences),
             tuple(missing),
-            0 if fitted is None else fitted.rollouts,
+            0 if fitted is None else len(fitted.rollouts),
         )
         return replace(found, tested=facts, notes=(*found.notes, *getattr(self.simulator.of, "notes", ())))
 
@@ -227,23 +227,6 @@ def _without(log: Log, drives: Log, car: GapPlant, bare: GapPlant) -> Log:
     """The car's log less what it does beyond a `bare` one."""
     whole, less = responses(drives, car), responses(drives, bare)
     return replace(log, **{n: getattr(log, n) - whole[n] + less[n] for n in whole if getattr(log, n) is not None})
-
-
-def _beside(
-    simulator: ExternalSimulator,
-    logs: Sequence[Log],
-    outputs: Sequence[Log],
-    offsets: tuple[float, ...],
-    errors: dict[str, float],
-    rollouts: Rollouts | None,
-    fitted: Adjusted | None,
-    progress: Progress | None = None,
-) -> SimulatorBesideCar:
-    """With the surrogate of these `outputs`, and the car's logs less what it leaves over."""
-    surrogate = surrogate_of(outputs, progress=progress)
-    cars = [replace(log, engaged=other.engaged) for log, other in zip(logs, outputs, strict=True)]
-    freed = tuple(without_discrepancy(log, other, surrogate.plant) for log, other in zip(cars, outputs, strict=True))
-    return SimulatorBesideCar(simulator, surrogate, tuple(outputs), freed, offsets, errors, rollouts, fitted)
 
 
 def responses(drives: Log, plant: GapPlant) -> dict[str, FloatArray]:

@@ -62,6 +62,7 @@ class WholeDrives(Protocol):
         ...
 
 
+Values = Mapping[str, float]
 Limits = Mapping[str, tuple[float, float]]
 """Lowest and highest value by parameter."""
 

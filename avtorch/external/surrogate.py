@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 
@@ -200,7 +200,8 @@ def _entered(now: NoiseFree, kinds: Sequence[EngineEffect]) -> NoiseFree | None:
             starts.setdefault(promise.effect, []).append(promise.start)
     rough = [max((h.fitted(4) for h in _begun(now, e, starts[e])), key=objective) for e in starts]
     best = sorted(rough, key=lambda h: -objective(h))[:_HELD_OUT]
-    fits = [_with_limits(h.fitted(12)) for h in best]
+    # with limits of the command that a fit put out of reach brought back, where that explains more
+    fits = [cast("NoiseFree", other_limit(h.fitted(12))) for h in best]
     left = [h.held_out / before for h in fits]
     worth = [(share * _PER_PARAMETER ** len(h.free), n) for n, (share, h) in enumerate(zip(left, fits, strict=True))]
     worth = [(value, n) for value, n in worth if left[n] < _WORTH]
@@ -216,13 +217,6 @@ def _begun(now: NoiseFree, effect: str, starts: Sequence[tuple[float, ...]]) -> 
             shorter["T_L"] *= _SHORTER
             out.append(shorter)
     return out
-
-
-def _with_limits(h: NoiseFree) -> NoiseFree:
-    """The model with limits of the command that a fit put out of reach brought back, where that explains more."""
-    found = other_limit(h)
-    assert isinstance(found, NoiseFree)
-    return found
 
 
 def _without_the_idle(now: NoiseFree, size: FloatArray, enough: float) -> NoiseFree:
@@ -275,7 +269,7 @@ class SimulatorCheck(Displayed):
         lines = [f"{self.name} answers as"]
         for name, value in self.values.items():
             effect, _, key = name.rpartition(".")
-            unit = {"T_L": "s", "K_L": "-"}.get(key) if not effect else unit_of(key)
+            unit = unit_of(key)
             words = f"{effect}: {words_of(key)}" if effect else {"T_L": "lag T_L", "K_L": "gain K_L"}[key]
             lines.append(f"  {words} {value:.3g}{'' if unit == '-' else f' {unit}'}")
         return "\n".join([*lines, f"and that is all but {100 * self.left:.1f} % of its response."])

@@ -8,8 +8,6 @@ not learn of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 from avtorch.errors import InputError
 from avtorch.external.simulator import DrivenPlant, Simulator, with_values
 from avtorch.gap.result.diagnosis import Diagnosis
@@ -59,18 +57,11 @@ def wrap(simulator: Simulator, found: Diagnosis) -> Wrapped:
     return Wrapped(simulator, own, car)
 
 
-@dataclass(eq=False)
 class Wrapped:
     """A `Simulator`: another one, and what a car (`car`) does beyond its surrogate (`own`)."""
 
-    simulator: Simulator
-    own: GapPlant
-    car: GapPlant
-    _without: DrivenPlant = field(init=False, repr=False)
-    _with: DrivenPlant = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        self._without, self._with = DrivenPlant(self.own), DrivenPlant(self.car)
+    def __init__(self, simulator: Simulator, own: GapPlant, car: GapPlant) -> None:
+        self.simulator, self._without, self._with = simulator, DrivenPlant(own), DrivenPlant(car)
 
     def reset(self, *, speed: float, accel: float) -> None:
         """Begin a drive, see `Simulator.reset`."""

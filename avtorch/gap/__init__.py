@@ -43,17 +43,15 @@ from avtorch.gap.simulator.effect import (
     Effect,
     EffectContext,
     NoiseChange,
-    effect_class,
     register,
 )
 from avtorch.gap.simulator.force_table import FREE_FORMS, ForceTable, ResistanceCurve
 from avtorch.gap.simulator.parameter import Domain, Parameter
-from avtorch.gap.simulator.plant import BASELINE, GapPlant, plant
-from avtorch.gap.simulator.recursion import scan, scan_pair
+from avtorch.gap.simulator.plant import GapPlant, plant
+from avtorch.gap.simulator.recursion import scan
 from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
 
 __all__ = [
-    "BASELINE",
     "EFFECTS",
     "FREE_FORMS",
     "PLACES",
@@ -92,9 +90,7 @@ __all__ = [
     "SpeedDependentLag",
     "SpeedSensorLag",
     "ViscousDrag",
-    "effect_class",
     "plant",
     "register",
     "scan",
-    "scan_pair",
 ]

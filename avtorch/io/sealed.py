@@ -42,8 +42,7 @@ def _feed(state: Any, x: Any) -> None:
     elif isinstance(x, bytes):
         _tagged(state, "bytes", x)
     elif isinstance(x, type):
-        # files made under an earlier name of a class stay good
-        _tagged(state, "type", vars(x).get("fingerprint_name", f"{x.__module__}.{x.__qualname__}").encode())
+        _tagged(state, "type", f"{x.__module__}.{x.__qualname__}".encode())
     elif is_dataclass(x):
         _feed(state, type(x))
         for field in fields(x):

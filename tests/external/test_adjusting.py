@@ -63,7 +63,7 @@ def fitted(log: Log, most: int = 50) -> tuple[dict[str, tuple[float, float, bool
 
     rollouts = Rollouts([log], values_of(own, LIMITS), drive, most)
     found = adjusted(rollouts, LIMITS)
-    return {p.name: (p.car.mean, p.car.sd, p.differs) for p in found.parameters}, found.rollouts
+    return {p.name: (p.car.mean, p.car.sd, p.differs) for p in found.parameters}, len(found.rollouts)
 
 
 @pytest.mark.statistical

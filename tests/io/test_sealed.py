@@ -7,15 +7,13 @@ import hashlib
 import json
 import os
 import random
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
 
 from avtorch.errors import InputError
-from avtorch.gap import SimulatorInput
 from avtorch.io import Damaged, fingerprint, read_sealed, read_sealed_bytes, write_sealed
 
 SCHEMA = "avtorch.test/1"
@@ -162,22 +160,3 @@ def test_fingerprints_are_equal_for_equal_values_only(fresh_seed: int) -> None:
     for value in (object(), np.array([object()]), {1, 2}, [lambda: 0]):
         with pytest.raises(TypeError):
             fingerprint(value)
-
-
-def test_a_class_that_was_renamed_keeps_its_fingerprint() -> None:
-    """Fits kept under the earlier name are found again; a subclass is another class."""
-
-    @dataclass(frozen=True)
-    class Before:
-        x: float
-
-    @dataclass(frozen=True)
-    class After:
-        fingerprint_name: ClassVar[str] = f"{Before.__module__}.{Before.__qualname__}"
-        x: float
-
-    class Own(After):
-        pass
-
-    assert fingerprint(Before(0.5)) == fingerprint(After(0.5)) != fingerprint(Own(0.5))
-    assert SimulatorInput.fingerprint_name == "avtorch.gap.simulator.drive.Drive"

@@ -394,9 +394,6 @@ class Gust(Effect):
     def in_words(cls, values: Mapping[str, float]) -> str:
         return f"wind and road push the car at random by {values['sd_mps2']:.2g} m/s²"
 
-    def start(self, x: Tensor, row: EffectContext) -> Any:
-        return None
-
     def advance(self, x: Tensor, row: EffectContext, state: Any) -> tuple[Tensor, Any]:
         if row.normal is None:
             return torch.zeros_like(x), None

@@ -88,7 +88,8 @@ class Actuator:
         steps = parts[0].target.shape[-1] - 1
         parts = [part.rows(slice(0, steps)) for part in parts]
         rows = self._rows(accel0, parts)
-        before = ActuatorState(*(None if x is None else x[..., :-1] for x in vars(rows).values()))
+        swing, target = (None if x is None else x[..., :-1] for x in (rows.swing, rows.target))
+        before = ActuatorState(rows.accel[..., :-1], swing, target)
         return rows.accel, self.step(before, parts)[1]
 
     def _rows(self, accel0: Tensor, parts: list[Substep]) -> ActuatorState:

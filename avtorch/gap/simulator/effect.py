@@ -321,13 +321,7 @@ def register(cls: E) -> E:
 
 
 def effect_class(name: str, more: Iterable[type[Effect]] = ()) -> type[Effect]:
-    """The effect called `name`, among those registered and `more`. Raises `InputError` if there is none.
-
-    Example:
-        >>> from avtorch.gap import effect_class
-        >>> effect_class("dead_time")(delay_s=0.2)
-        DeadTime(delay_s=0.2)
-    """
+    """The effect called `name`, among those registered and `more`. Raises `InputError` if there is none."""
     known = {**EFFECTS, **{cls.name: cls for cls in more}}
     if name not in known:
         close = get_close_matches(name[:_NAME], known, n=1)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal, cast
 
@@ -69,7 +69,7 @@ class Parameter:
     def __post_init__(self) -> None:
         if not self.low < self.high:
             raise InputError(f"{self.name}: found the range {self.low:g} to {self.high:g}, needs low < high")
-        if self.constraint != "interval" and not all(math.isfinite(x) for x in self._ends()):
+        if self.constraint != "interval" and not all(math.isfinite(x) for x in self._ends):
             raise InputError(f"{self.name}: {self.low:g} to {self.high:g} is not within {self.constraint!r}")
         if self.possible is not None and not self.possible[0] < self.possible[1]:
             raise InputError(f"{self.name}: found possible={self.possible!r}, needs low < high")
@@ -77,14 +77,14 @@ class Parameter:
     @property
     def location(self) -> float:
         """Centre of the prior on the link's scale."""
-        return 0.0 if self.constraint == "interval" else 0.5 * sum(self._ends())
+        return 0.0 if self.constraint == "interval" else 0.5 * sum(self._ends)
 
     @property
     def spread(self) -> float:
         """Standard deviation of the prior on the link's scale."""
         if self.constraint == "interval":
             return 1.0
-        low, high = self._ends()
+        low, high = self._ends
         return abs(high - low) / (2 * _CENTRAL_80)
 
     @property
@@ -98,11 +98,22 @@ class Parameter:
         low, high = sorted(float(x) for x in self.constrain(z))
         return low, high
 
+    @cached_property
     def _ends(self) -> tuple[float, float]:
-        return _ends(self.constraint, self.low, self.high)
+        """`low` and `high` on the link's scale."""
+        low, high = (float(self._link(torch.tensor(x, dtype=torch.float64))) for x in (self.low, self.high))
+        return low, high
 
     def _link(self, value: Tensor) -> Tensor:
-        return _link(self.constraint, self.low, self.high, value)
+        if self.constraint == "positive":
+            return value.log()
+        if self.constraint == "negative":
+            return (-value).log()
+        if self.constraint == "unit":
+            return torch.logit(value)
+        if self.constraint == "interval":
+            return _normal_quantile((value - self.low) / (self.high - self.low))
+        return value
 
     def constrain(self, z: Tensor) -> Tensor:
         """The value for `z`, elementwise."""
@@ -130,25 +141,6 @@ class Parameter:
         """Draws from the prior, of the given shape (and the parameter's size last, where it has one)."""
         full = shape if self.size == 1 else (*shape, self.size)
         return self.constrain(torch.randn(full, generator=generator, dtype=torch.float64))
-
-
-def _link(constraint: Constraint, low: float, high: float, value: Tensor) -> Tensor:
-    if constraint == "positive":
-        return value.log()
-    if constraint == "negative":
-        return (-value).log()
-    if constraint == "unit":
-        return torch.logit(value)
-    if constraint == "interval":
-        return _normal_quantile((value - low) / (high - low))
-    return value
-
-
-@lru_cache(maxsize=1024)
-def _ends(constraint: Constraint, low: float, high: float) -> tuple[float, float]:
-    """`low` and `high` on the link's scale. Asked at every simulation of a fit."""
-    first, last = (float(_link(constraint, low, high, torch.tensor(x, dtype=torch.float64))) for x in (low, high))
-    return first, last
 
 
 @dataclass(frozen=True)

@@ -38,11 +38,6 @@ BASELINE = (
 Possible are lags from an electric motor's torque control with its driveline (about 20 ms) to the engine and air brakes
 of a laden truck (seconds), and gains as far from 1 as a truck's mass changes between empty and laden (about a factor of
 three).
-
-Example:
-    >>> from avtorch.gap import BASELINE
-    >>> {p.name: [round(x, 2) for x in p.physical] for p in BASELINE}  # what physics allows at all
-    {'T_L': [0.02, 5.0], 'K_L': [0.3, 3.5]}
 """
 
 

@@ -42,15 +42,6 @@ def scan_pair(
     """The two components (..., time) of `x[k] = A[k] x[k-1] + beta[k]`, `A = [[m0, m1], [m2, m3]]`.
 
     Args: `matrix` four of (..., time) or (..., 1), `beta` two of (..., time), `start` two of (...). All broadcast.
-
-    Example:
-        >>> import torch
-        >>> from avtorch.gap import scan_pair
-        >>> turn = tuple(torch.tensor([x]) for x in (0.0, -1.0, 1.0, 0.0))  # by 90 degrees a row
-        >>> none, start = torch.zeros(4), (torch.tensor(1.0), torch.tensor(0.0))
-        >>> x, y = scan_pair(turn, (none, none), start)
-        >>> (x + 0.0).tolist(), (y + 0.0).tolist()
-        ([0.0, -1.0, 0.0, 1.0], [1.0, 0.0, -1.0, 0.0])
     """
     first, second = _Scan.apply(*_aligned(2, list(matrix), list(beta), list(start)))
     return first, second

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -36,8 +36,6 @@ class SimulatorInput:
         >>> bool(drive.uniform), round(drive.position[-1].item(), 2)  # metres
         (True, 99.0)
     """
-
-    fingerprint_name: ClassVar[str] = "avtorch.gap.simulator.drive.Drive"
 
     time: Tensor
     command: Tensor

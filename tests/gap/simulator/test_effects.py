@@ -12,6 +12,7 @@ import torch
 from avtorch import gap
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, Effect, GapPlant, SimulatorInput, plant
+from avtorch.gap.simulator.effect import effect_class
 from avtorch.vehicle import Block, GLVDPlant
 from tests.bars import BAR
 from tests.gap.drives import drive_of, driven, filled, smooth_drive
@@ -414,7 +415,7 @@ def test_effects_report_wrong_values() -> None:
     with pytest.raises(InputError, match="natural_frequency"):
         gap.SecondOrderActuator.of({"natural_frequency_radps": 0.0})
     with pytest.raises(InputError, match="no_such"):
-        gap.effect_class("no_such")
+        effect_class("no_such")
     assert isinstance(plant([gap.DeadTime]), GapPlant)
 
 

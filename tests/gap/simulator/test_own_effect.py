@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-import avtorch
 from avtorch.errors import InputError
-from avtorch.gap import EFFECTS, Effect, GapPlant, SimulatorInput, effect_class, plant
+from avtorch.gap import EFFECTS, Effect, GapPlant, SimulatorInput, plant
+from avtorch.gap.simulator.effect import effect_class
 from tests.gap.drives import drive_of, driven
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "own-effect.md"
@@ -87,4 +87,4 @@ def test_names_are_taken_once(shown: dict) -> None:
 
     with pytest.raises(InputError, match="another effect"):
         register(type("Other", (shown["Trailer"],), {}))
-    assert avtorch.gap.effect_class("trailer") is shown["Trailer"]
+    assert effect_class("trailer") is shown["Trailer"]

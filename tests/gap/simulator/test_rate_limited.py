@@ -86,23 +86,6 @@ def test_slewed_rows_are_the_closed_form(fresh_seed: int) -> None:
         torch.testing.assert_close(got[:, k], state, rtol=0, atol=1e-12)
 
 
-def test_shapes_broadcast_and_nothing_is_differentiated() -> None:
-    time = torch.arange(ROWS, dtype=D) * 0.05
-    target = torch.sin(3 * time)
-    lag = torch.tensor([[0.2], [0.5]], dtype=D, requires_grad=True)
-    part = Substep(target, lag, torch.tensor(0.05, dtype=D))
-    jerk = torch.tensor([[1.0], [4.0]], dtype=D)
-    got = by_rows(torch.zeros((), dtype=D), [part], (jerk, jerk))
-    assert got.shape == (2, ROWS)
-    assert not got.requires_grad
-    for i in range(2):
-        own = Substep(target, lag[i].detach(), torch.tensor(0.05, dtype=D))
-        alone = by_rows(torch.zeros((), dtype=D), [own], (jerk[i], jerk[i]))
-        torch.testing.assert_close(got[i], alone, rtol=0, atol=1e-14)
-    single = by_rows(torch.zeros((), dtype=D), [own], (torch.tensor(4.0, dtype=D),) * 2)
-    torch.testing.assert_close(single, got[1], rtol=0, atol=1e-14)
-
-
 def test_a_limit_that_never_binds_is_the_lag_alone() -> None:
     target, h, lag = torch.ones(ROWS, dtype=D), torch.tensor(0.05, dtype=D), torch.tensor([0.4], dtype=D)
     got = by_rows(torch.zeros((), dtype=D), [Substep(target, lag, h)], (torch.tensor(float("inf"), dtype=D),) * 2)
