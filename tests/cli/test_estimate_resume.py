@@ -39,8 +39,8 @@ def answer(out: Path) -> dict[str, Any]:
 
 def with_each_window(call: Callable[[object], None], monkeypatch: pytest.MonkeyPatch) -> None:
     """The command calls this, too, as a window is done."""
-    work = avtorch.decision.estimation.estimate
-    monkeypatch.setattr(avtorch.decision.estimation, "estimate", partial(work, finished=call))
+    work = estimation.estimate
+    monkeypatch.setattr(estimation, "estimate", partial(work, finished=call))
 
 
 @pytest.fixture
