@@ -15,7 +15,7 @@ Example:
 
 from avtorch.pedals.export import MapTable, accel_table, brake_table, read_map, write_map
 from avtorch.pedals.fit_map import HeldOut, PedalFit, fit_pedals
-from avtorch.pedals.pedal_command import PedalCommand
+from avtorch.pedals.pedal_drive import PedalCommand
 from avtorch.pedals.pedal_map import PedalMap, PedalTable
 
 __all__ = [
