@@ -164,9 +164,8 @@ def propose(table: Table, *, map: Pairs = None, unit: Pairs = None) -> Proposal:
     parts = _parts(clock)
     doubts: list[str] = _twice(table)
     left = [column for column in columns if column.name != time.column]
-    assigned = assign(clock, parts, left, {signal: given[signal] for signal in MOTION if signal in given})
-    found, reasons = assigned.found, assigned.reasons
-    doubts += assigned.doubts
+    found, reasons, asked = assign(clock, parts, left, {signal: given[signal] for signal in MOTION if signal in given})
+    doubts += asked
     if not {"accel_cmd", "accel"} & set(given):
         _swapped(clock, parts, found, reasons)
     units = _units(clock, parts, found, reasons, doubts)
