@@ -32,13 +32,8 @@ def atomic(path: str | os.PathLike[str], *, binary: bool = False) -> Iterator[IO
     except OSError as fault:
         raise InputError(f"{target}: cannot be written ({fault.strerror or fault})") from None
     try:
-        try:
-            # newline="" keeps line ends as given, so that a log has the same bytes on every system
-            opened = os.fdopen(handle, "wb") if binary else os.fdopen(handle, "w", encoding="utf-8", newline="")
-        except BaseException:
-            os.close(handle)
-            raise
-        with opened as stream:
+        # newline="" keeps line ends as given, so that a log has the same bytes on every system
+        with os.fdopen(handle, "wb") if binary else os.fdopen(handle, "w", encoding="utf-8", newline="") as stream:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())

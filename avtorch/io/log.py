@@ -357,14 +357,13 @@ def as_logs(
     given: LogSource | Sequence[LogSource], *, map: Pairs = None, unit: Pairs = None, argument: str = "logs"
 ) -> list[Log]:
     """One log or several, each as `as_log` takes it, all with the same `map` and `unit`."""
-    if isinstance(given, (Log, str, os.PathLike)) or is_dataframe(given):
-        return [as_log(given, map=map, unit=unit, argument=argument)]  # pyright: ignore[reportArgumentType]
-    if isinstance(given, dict) or not hasattr(given, "__iter__"):
+    one = isinstance(given, (Log, str, os.PathLike, dict)) or is_dataframe(given) or not hasattr(given, "__iter__")
+    if one:
         return [as_log(given, map=map, unit=unit, argument=argument)]  # pyright: ignore[reportArgumentType]
     # a log that has been read has its names and units; the others take those given
     return [
-        as_log(one, argument=argument) if isinstance(one, Log) else as_log(one, map=map, unit=unit, argument=argument)
-        for one in given  # pyright: ignore[reportGeneralTypeIssues]
+        as_log(log, argument=argument) if isinstance(log, Log) else as_log(log, map=map, unit=unit, argument=argument)
+        for log in given  # pyright: ignore[reportGeneralTypeIssues]
     ]
 
 

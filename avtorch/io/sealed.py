@@ -113,7 +113,7 @@ def read_sealed(path: Path, *, schema: str, most: int = MOST, remedy: str = REME
 
 
 def read_sealed_bytes(path: Path, *, schema: str, most: int = MOST, remedy: str = REMEDY) -> Sealed:
-    """The same of a file with bytes as its content."""
+    """The same of a file with bytes as its content. Raises `InputError` and `Damaged` likewise."""
     try:
         raw = read_regular(path, most=most, need="a regular file", links=False)
     except TooLarge:

@@ -68,7 +68,7 @@ def _halted(accel_cmd: FloatArray, accel: FloatArray, dt: float) -> BoolArray:
     late = (sums[at] - sums[at - short]) / short  # the deceleration lasts into the final third
     early = (sums[at + 1 + short] - sums[at + 1]) / short
     since = _count(0.5 * _SINCE_S, dt)  # half of the time each for the search of the minimum and of the rise after it
-    eased = _latest_max(accel_cmd - _latest_min(accel_cmd, since), since) > _EASED_MPS2
+    eased = _latest_max(accel_cmd + _latest_max(-accel_cmd, since), since) > _EASED_MPS2
     ends = (slowed < _SLOWED_MPS2) & (late < 0.7 * slowed) & (early > 0.4 * slowed) & (np.abs(rests) < -0.25 * slowed)
     found = np.zeros(rows, bool)
     found[at + 1] = ends & ~eased[at + n] & (_latest_max(accel_cmd, n)[at + n] < _STILL_BRAKED_MPS2)
@@ -87,11 +87,6 @@ def _latest_max(x: FloatArray, width: int) -> FloatArray:
     """The largest of each row and the `width` rows before it."""
     padded = np.concatenate([np.full(2 * width + 1, -np.inf), x])
     return np.asarray(maximum_filter1d(padded, width + 1, origin=width // 2)[2 * width + 1 :])
-
-
-def _latest_min(x: FloatArray, width: int) -> FloatArray:
-    """The smallest of each row and the `width` rows before it."""
-    return -_latest_max(-x, width)
 
 
 def _slow(accel: FloatArray, dt: float, below: float) -> int:

@@ -23,7 +23,7 @@ from avtorch.io.formats.parquet import Cells, readable
 from avtorch.io.formats.parquet import cells_of as arrow_cells
 from avtorch.io.formats.parquet import is_time as is_time_type
 from avtorch.io.opening import MOST_BYTES, MOST_CELLS, MOST_COLUMNS, beginning, place, read_regular
-from avtorch.io.text import decoded, is_time, layout_of, rows_of, seconds_of, unzipped
+from avtorch.io.text import decoded, is_time, is_value, layout_of, rows_of, seconds_of, unzipped
 from avtorch.numeral import numeral
 
 _NEED = "a CSV or Parquet file"
@@ -101,7 +101,7 @@ class Table:
         if isinstance(cells, np.ndarray):
             values = np.array(cells, dtype=np.float64)
             empty = np.zeros(len(values), dtype=bool)
-        elif as_time and (first := next((c for c in cells if _is_text(c)), None)) is not None and is_time(first):
+        elif as_time and is_time(next((c for c in cells if isinstance(c, str) and c.strip()), "")):
             values = seconds_of([cell if isinstance(cell, str) else "" for cell in cells])
             for row in np.flatnonzero(np.isnan(values)).tolist():
                 if row not in faults:
@@ -163,10 +163,6 @@ _TIME = "a time is needed: a number, or as 2024-04-23 12:31:47.388 or 12:31:47.3
 _STATES = {"true": 1.0, "false": 0.0, "on": 1.0, "off": 0.0, "yes": 1.0, "no": 0.0}
 
 
-def _is_text(cell: Any) -> bool:
-    return isinstance(cell, str) and bool(cell.strip())
-
-
 def _number(cell: Any) -> float:
     """A cell that is not text: an integer may be too large, and bytes are text not yet decoded."""
     if isinstance(cell, (bytes, bytearray)):
@@ -198,7 +194,9 @@ def read_table(path: str | os.PathLike[str], *, wanted: Wanted | None = None) ->
     wanted = None if wanted is None else _with_halves(wanted)
     if beginning(file, 4, need=_NEED) == b"PAR1":
         return _parquet(file, wanted)
-    raw = read_bytes(file)
+    raw = unzipped(place(file), read_regular(file, most=MOST_BYTES, need=_NEED))
+    if not raw.strip():
+        raise InputError(f"{place(file)}: is empty; a header line and rows are needed")
     if file.suffix.lower() in (".parquet", ".pq"):
         raise InputError(f"{place(file)}: named as Parquet but its content is not; write it anew, or name it .csv")
     text, remarks = decoded(place(file), raw)
@@ -212,14 +210,6 @@ def _parquet(file: Path, wanted: Wanted | None) -> Table:
         for name in columns.column_names
     }
     return Table(place(file), names, tuple(read.get(name) for name in names), form="Parquet")
-
-
-def read_bytes(file: Path) -> bytes:
-    """The content of a file, unzipped; InputError where there is none."""
-    raw = unzipped(place(file), read_regular(file, most=MOST_BYTES, need=_NEED))
-    if not raw.strip():
-        raise InputError(f"{place(file)}: is empty; a header line and rows are needed")
-    return raw
 
 
 def text_table(source: str, text: str, wanted: Wanted | None) -> Table:
@@ -258,19 +248,11 @@ def _names(source: str, found: tuple[list[str], int] | None) -> tuple[str, ...]:
         raise InputError(f"{source}: line {line}: has {len(head):,} columns; needs {MOST_COLUMNS:,} at most")
     if re.match(r"\s*(\{|\[\s*[\[{\"0-9-])", head[0]):
         raise InputError(f"{source}: line {line}: looks like JSON; a CSV or Parquet file is needed")
-    if all(_is_number(name) for name in head):
+    if all(map(is_value, head)):
         raise InputError(
             f"{source}: line {line}: holds numbers; the first line must be the header with the column names"
         )
     return tuple(cell if cell.strip() else f"(unnamed {i + 1})" for i, cell in enumerate(head))
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text.replace(",", "."))
-    except ValueError:
-        return False
-    return True
 
 
 _NANOSECONDS = re.compile(r"(?P<stem>.*?)(?:nanosecs?|nsecs?|ns)")

@@ -219,7 +219,7 @@ def _made(lines: Sequence[str], separator: str) -> float:
         return 0.0
     width = widths.most_common(1)[0][0]
     cells = [cell for row in rows if len(row) == width and _has_data(row) for cell in row]
-    return sum(len(row) == width for row in rows) / len(rows) * sum(map(_is_value, cells)) / len(cells)
+    return sum(len(row) == width for row in rows) / len(rows) * sum(map(is_value, cells)) / len(cells)
 
 
 def _header(head: Sequence[tuple[int, str]], rows: Sequence[tuple[int, list[str]]], separator: str) -> tuple[int, str]:
@@ -258,10 +258,11 @@ def _are_units(below: Sequence[Sequence[str]], width: int) -> bool:
 
 
 def _has_data(cells: Sequence[str]) -> bool:
-    return any(_is_value(cell) for cell in cells)
+    return any(is_value(cell) for cell in cells)
 
 
-def _is_value(cell: str) -> bool:
+def is_value(cell: str) -> bool:
+    """Whether a cell is a number, by either decimal mark, or a time."""
     if _COMMA_NUMBER.fullmatch(cell) or is_time(cell):
         return True
     try:

@@ -13,6 +13,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -148,8 +149,7 @@ _LARGEST = 1e9  # of a speed or an acceleration, in any unit
 _ACCELS = ("m/s2", "g", "mg", "cm/s2", "ft/s2")
 
 
-@dataclass(frozen=True)
-class Assigned:
+class Assigned(NamedTuple):
     """The columns `found` by signal, the `reasons` of each, and `doubts`, in sentences."""
 
     found: dict[str, Column]

@@ -15,10 +15,10 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.io.clock import stretches
 from avtorch.io.log import Log
+from avtorch.io.units import SI
 from avtorch.logcheck.late_channel import late_channel
 
 _CHANNELS = ("accel_cmd", "accel", "speed")
-_UNITS = {"accel_cmd": "m/s²", "accel": "m/s²", "speed": "m/s"}
 _COARSE = 0.005  # of a signal's SD: a last digit from which it is told
 _AGREE = 0.8  # correlation of two signals whose lateness means something
 _TREMBLES_HZ = 3.0
@@ -46,7 +46,7 @@ def recorder_notes(log: Log) -> list[str]:
     for name in _CHANNELS:
         values = getattr(log, name)
         if values is not None and (step := quantum(values)) is not None:
-            notes.append(f"{name} is rounded to {step:.3g} {_UNITS[name]}")
+            notes.append(f"{name} is rounded to {step:.3g} {SI[name]}")
     parts = stretches(log.usable, log.segment)
     slope = None if log.speed is None else slope_of(log.elapsed, log.speed)
     if (known := late_channel(log)) is not None:

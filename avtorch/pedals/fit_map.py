@@ -88,15 +88,10 @@ class HeldOut:
         """Root of the mean squared error of speed [m/s]."""
         return float(np.sqrt(self.squares[model].mean()))
 
-    def gain(self, over: str, *, of: str = "map") -> tuple[float, float]:
-        """By how much the squared error of `of` is below that of `over`, block by block, and its standard error."""
-        less = self.squares[over] - self.squares[of]
-        return float(less.mean()), float(less.std(ddof=1) / np.sqrt(len(less)))
-
     def better_than(self, over: str) -> bool:
-        """Whether the map's gain is above two of its standard errors."""
-        gain, error = self.gain(over)
-        return gain > 2 * error
+        """Whether the map's squared error is below that of `over`, block by block, by two standard errors or more."""
+        less = self.squares[over] - self.squares["map"]
+        return float(less.mean()) > 2 * float(less.std(ddof=1) / np.sqrt(len(less)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,19 +100,7 @@ class PedalFit:
 
     Standard errors [s] of the lag of `map`, of its dead time and of their sum, which is known far better than its
     parts. `held_out`: how well it foretells blocks left out; `plant`: the map as a plant of the command of
-    `PedalCommand`, None of a commanded speed; `sizes`: of the table and the resistance, relative to
-    accelerations, chosen there; `seconds`: how long a drive it saw.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch import Log
-        >>> from avtorch.pedals import fit_pedals
-        >>> time = np.arange(0.0, 60.0, 0.05)
-        >>> throttle = 0.3 + 0.2 * np.sin(0.5 * time)
-        >>> speed = 15.0 + 1.2 * np.sin(0.5 * time - np.pi / 2)
-        >>> found = fit_pedals(Log.from_arrays(time=time, throttle=throttle, speed=speed))
-        >>> sorted(found.map.pedals), found.seconds > 55
-        (['throttle'], True)
+    `PedalCommand`, None of a commanded speed.
     """
 
     map: PedalMap
@@ -126,8 +109,6 @@ class PedalFit:
     late_sd: float
     held_out: HeldOut
     plant: GapPlant | None
-    sizes: Sizes
-    seconds: float
 
 
 def fit_pedals(logs: LogSource | Sequence[LogSource]) -> PedalFit:
@@ -170,7 +151,7 @@ def fit_pedals(logs: LogSource | Sequence[LogSource]) -> PedalFit:
     lag, late = made.T_L * changes[:, -2], changes[:, -1]
     T_L_sd, dead_time_sd, late_sd = (float(np.sqrt((x**2).sum())) for x in (lag, late, lag + late))
     made = _with_errors(made, drive, fit, changes[:, :-1])
-    return PedalFit(made, T_L_sd, dead_time_sd, late_sd, score, car, sizes, drive.seconds)
+    return PedalFit(made, T_L_sd, dead_time_sd, late_sd, score, car)
 
 
 def _plant_of(fit: Fit, dead_time: float) -> GapPlant:

@@ -152,9 +152,7 @@ class Child:
             )
         self._process.kill()
         code = self._process.wait()
-        how = f"status {code}"
-        if code < 0:
-            how = signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
+        how = signal.Signals(-code).name if -code in signal.valid_signals() else f"status {code}"
         return InputError(
             f"{self.source}: is damaged, or takes more memory than it may: it ended the process that read it ({how}); "
             f"an undamaged {self._words} file is needed"

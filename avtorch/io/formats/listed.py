@@ -28,13 +28,6 @@ class Channel:
     time: FloatArray
     values: FloatArray
 
-    def __post_init__(self) -> None:
-        for what, given in (("time", self.time), ("values", self.values)):
-            if given.ndim != 1 or given.dtype != np.float64 or len(given) != len(self.time):
-                raise ValueError(
-                    f"{self.name}: {what} is {given.dtype} {given.shape}; float64 ({len(self.time)},) is needed"
-                )
-
 
 class Recording:
     """An opened file: the file as messages name it (`source`), its `form` in words, such as ``MDF 4.10``, all numeric

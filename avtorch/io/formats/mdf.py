@@ -48,14 +48,14 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
             remarks.append("the file is cut off; blocks that its end cuts are left out")
         if unfinished:
             remarks.append("the recorder did not finish the file; it was completed as far as it goes")
-        listing = _Listing(mdf)
+        places, units, left = _listing(mdf)
 
     def load(names: tuple[str, ...]) -> dict[str, Channel]:
-        refuse_cells(source, sum(mdf.groups[listing.places[name][0]].channel_group.cycles_nr for name in names))
+        refuse_cells(source, sum(mdf.groups[places[name][0]].channel_group.cycles_nr for name in names))
         times: dict[int, FloatArray] = {}
         channels = {}
         for name in names:
-            group, index = listing.places[name]
+            group, index = places[name]
             with guarded(f"{source}: channel {quoted(name, 80)}", _NEED):
                 signal = mdf.get(group=group, index=index, raw=True, ignore_invalidation_bits=True)
                 values = _physical(signal)
@@ -72,7 +72,7 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
                 channels[name] = Channel(name, time, values)
         return channels
 
-    return Recording(source, f"MDF {mdf.version}", listing.places, listing.units, remarks + listing.remarks, load)
+    return Recording(source, f"MDF {mdf.version}", places, units, remarks + left, load)
 
 
 def _in_memory(path: str | os.PathLike[str]) -> io.BytesIO:
@@ -86,48 +86,41 @@ def _loaded(asammdf: Any, stream: BinaryIO, *, whole: bool) -> Any:
     return asammdf.MDF(stream, process_bus_logging=False)
 
 
-class _Listing:
-    """The numeric channels of a file: places and units by name."""
+def _listing(mdf: Any) -> tuple[dict[str, tuple[int, int]], dict[str, str], list[str]]:
+    """The numeric channels of a file: places and units by name; and remarks."""
+    four = mdf.version >= "4"
+    found: list[tuple[str, str, int, int, str]] = []  # name, group's name, group, index, unit
+    untimed = 0
+    for g, group in enumerate(mdf.groups):
+        numbers = [i for i in range(len(group.channels)) if _is_number(group, i, four)]
+        if not _has_time(mdf, g, group, four):
+            untimed += bool(numbers)
+            continue
+        for i in numbers:
+            found.append((group.channels[i].name, _group_name(group), g, i, _unit(group.channels[i])))
+    names = _told_apart([x[:3] for x in found])
+    places = {name: x[2:4] for name, x in zip(names, found, strict=True)}
+    units = {name: x[4] for name, x in zip(names, found, strict=True) if x[4]}
+    return places, units, [f"{untimed} groups without a time are left out"] if untimed else []
 
-    def __init__(self, mdf: Any) -> None:
-        self.four = mdf.version >= "4"
-        self.remarks: list[str] = []
-        found: list[tuple[str, str, int, int, str]] = []  # name, group's name, group, index, unit
-        untimed = 0
-        for g, group in enumerate(mdf.groups):
-            if not self._has_time(mdf, g, group):
-                untimed += any(self._is_number(group, i) for i in range(len(group.channels)))
-                continue
-            for i, channel in enumerate(group.channels):
-                if self._is_number(group, i):
-                    found.append((channel.name, _group_name(group), g, i, _unit(channel)))
-        if untimed:
-            self.remarks.append(f"{untimed} groups without a time are left out")
-        names = _told_apart([x[:3] for x in found])
-        self.places = {name: x[2:4] for name, x in zip(names, found, strict=True)}
-        self.units = {name: x[4] for name, x in zip(names, found, strict=True) if x[4]}
 
-    def _has_time(self, mdf: Any, g: int, group: Any) -> bool:
-        master = mdf.masters_db.get(g)
-        if master is None:
-            # a group that shares the master of another one, as MDF 4.2 allows
-            return bool(getattr(group.channel_group, "cg_master_index", None) is not None)
-        return not self.four or group.channels[master].sync_type in (_TIME, _NO_SYNC)
+def _has_time(mdf: Any, g: int, group: Any, four: bool) -> bool:
+    master = mdf.masters_db.get(g)
+    if master is None:
+        # a group that shares the master of another one, as MDF 4.2 allows
+        return getattr(group.channel_group, "cg_master_index", None) is not None
+    return not four or group.channels[master].sync_type in (_TIME, _NO_SYNC)
 
-    def _is_number(self, group: Any, i: int) -> bool:
-        channel = group.channels[i]
-        kind = channel.channel_type
-        if self.four:
-            dependent = group.channel_dependencies[i]
-            return (
-                channel.data_type in _NUMBERS_4
-                and kind not in _MASTERS_4
-                and kind != _VARIABLE_LENGTH
-                and dependent is None
-            )
-        conversion = channel.conversion
-        dated = conversion is not None and conversion.conversion_type in _DATES_3
-        return channel.data_type in _NUMBERS_3 and kind == 0 and not dated
+
+def _is_number(group: Any, i: int, four: bool) -> bool:
+    channel = group.channels[i]
+    kind = channel.channel_type
+    if four:
+        plain = kind not in (*_MASTERS_4, _VARIABLE_LENGTH) and group.channel_dependencies[i] is None
+        return channel.data_type in _NUMBERS_4 and plain
+    conversion = channel.conversion
+    dated = conversion is not None and conversion.conversion_type in _DATES_3
+    return channel.data_type in _NUMBERS_3 and kind == 0 and not dated
 
 
 def _group_name(group: Any) -> str:
