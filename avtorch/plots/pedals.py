@@ -19,7 +19,8 @@ def shown_unit(name: str, largest: float) -> tuple[float, str]:
     return {"-": (100.0, "%"), "Pa": (1e-5, "bar")}.get(unit, (1.0, unit.replace("2", "²")))
 
 
-def _lines(ax: Axes, made: PedalMap, pedal: str) -> None:
+def pedal_lines(ax: Axes, made: PedalMap, pedal: str) -> Axes:
+    """The acceleration that one pedal demands at some speeds, the others at rest; bands are one standard error."""
     table = made.pedals[pedal]
     scale, unit = shown_unit(pedal, float(np.abs(table.pedal).max()))
     low, high = made.driven or (made.speed[0], made.speed[-1])
@@ -34,6 +35,7 @@ def _lines(ax: Axes, made: PedalMap, pedal: str) -> None:
     ax.axhline(0.0, color=GREY, linestyle=":", linewidth=1)
     ax.set(xlabel=f"{pedal} [{unit}]", ylabel="acceleration demanded [m/s²]", title=pedal)
     ax.legend(loc="best")
+    return ax
 
 
 @styled
@@ -55,5 +57,5 @@ def pedal_figure(made: PedalMap) -> Figure:
     count = len(made.pedals)
     figure = Figure(figsize=(1.5 + 4.2 * count, 3.8), layout="constrained")
     for ax, pedal in zip(figure.subplots(1, count, squeeze=False)[0], made.pedals, strict=True):
-        _lines(ax, made, pedal)
+        pedal_lines(ax, made, pedal)
     return figure

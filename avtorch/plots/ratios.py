@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
@@ -25,7 +26,12 @@ def ratio_figure(ratios: Mapping[str, Quantity], what: str = "ratio", *, narrow:
     """
     height = 0.9 + (0.72 if narrow else 0.5) * len(ratios)
     figure = Figure(figsize=(NARROW if narrow else WIDE, height), layout="constrained")
-    ax = figure.add_subplot()
+    ratio_whiskers(figure.add_subplot(), ratios, what, narrow=narrow)
+    return figure
+
+
+def ratio_whiskers(ax: Axes, ratios: Mapping[str, Quantity], what: str = "ratio", *, narrow: bool = False) -> Axes:
+    """The picture of `ratio_figure` in axes of your own."""
     for row, q in enumerate(ratios.values()):
         colour = GREY if q.q05 <= 1 <= q.q95 else BLUE
         ax.plot([q.q05, q.q95], [row, row], color=colour, linewidth=2.5)
@@ -57,4 +63,4 @@ def ratio_figure(ratios: Mapping[str, Quantity], what: str = "ratio", *, narrow:
     ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.3g}"))
     ax.grid(False, axis="y")
     ax.set_xlabel(what)
-    return figure
+    return ax
