@@ -14,9 +14,8 @@ from avtorch.inference.compiled import chosen
 from avtorch.inference.coordinates import Coordinates, stiffness
 from avtorch.inference.density import Density, SubsampledDensity, constrained, has_score, has_selection
 from avtorch.inference.device import check_generator
-from avtorch.inference.exactness import TAIL, Exactness, Moments, compare_with_exact, pieces_of, root_of
+from avtorch.inference.exactness import Exactness, compare_with_exact
 from avtorch.inference.map import Mode, find_mode
-from avtorch.inference.planes import empty_planes
 from avtorch.inference.posterior import Posterior, nested_rhat
 from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.inference.sgld import SGLD
@@ -85,17 +84,14 @@ def sample(
             coordinates, w = _walk(part, where, settings.slower(times), slowdown[index], generator)
             fresh = torch.isin(index, open_)
             new = index[fresh]
-            rhat, far, moments = _summary(part, settings, coordinates, w)
-            diverged[new] = _diverged(part, where, coordinates.z(far))[fresh]
-            unmixed[new] = ~(rhat.amax(-1) <= limit)[fresh]  # NaN counts as not converged
+            diverged[new] = _diverged(part, where, coordinates.z(_furthest(w)))[fresh]
+            unmixed[new] = ~(nested_rhat(w).amax(-1) <= limit)[fresh]  # NaN counts as not converged
             stuck[new] = (slowdown[new] > STUCK) | _too_wide(where, settings, slowdown[index], times)[fresh]
             z = coordinates.z(w)
             values = constrained(density, z)
             draws[:, :, new] = values if len(new) == len(index) else values[:, :, fresh]
             if settings.compare:
-                found = found.put(
-                    index, compare_with_exact(part, z, eager=settings.walk == "eager", moments=moments), fresh
-                )
+                found = found.put(index, compare_with_exact(part, z), fresh)
         slowdown = 2 * slowdown
         again = diverged | unmixed
         if settings.compare:
@@ -189,19 +185,11 @@ def _select(density: Density, index: Tensor) -> Density:
     return density.select(index)
 
 
-def _summary(
-    density: Density, settings: SamplerSettings, coordinates: Coordinates, w: Float[Tensor, "chain draw window d"]
-) -> tuple[Float[Tensor, "window d"], Float[Tensor, "window d"], Moments | None]:
-    """Nested R-hat of draws, the furthest of each window, ``(window, d)`` both, and their moments if compiled."""
-    chains, draws, windows, _ = w.shape
-    loops = chosen(density, settings)
-    if loops is not None:
-        rhat, far, mean, covariance, *rest = loops.summarised(coordinates, w, 8, pieces_of(chains, draws), TAIL)
-        return rhat, far, Moments(mean, root_of(covariance), *rest)
-    distance = w.square().sum(-1).nan_to_num_(nan=torch.inf)
-    furthest = distance.transpose(0, 1).flatten(0, 1).argmax(0)  # in the order of memory
-    far = w.transpose(0, 1).flatten(0, 1)[furthest, torch.arange(windows, device=w.device)]
-    return nested_rhat(w), far, None
+def _furthest(w: Float[Tensor, "chain draw window d"]) -> Float[Tensor, "window d"]:
+    """The draw of each window that is furthest from 0, ``(window, d)``."""
+    flat = w.transpose(0, 1).flatten(0, 1)  # in the order of memory
+    index = flat.square().sum(-1).nan_to_num_(nan=torch.inf).argmax(0)
+    return flat[index, torch.arange(w.shape[2], device=w.device)]
 
 
 def _diverged(
@@ -241,7 +229,7 @@ def _walk(
     # each window's own step is folded into its scale
     coordinates = Coordinates.of(mode, settings.whitening).slowed(slowdown)
     shape = (settings.chains, *mode.z.shape)
-    w = empty_planes(*shape, dtype=mode.z.dtype, device=mode.z.device).zero_()
+    w = torch.zeros(shape, dtype=mode.z.dtype, device=mode.z.device)
     if settings.spread > 0:
         start = torch.randn(shape, dtype=w.dtype, device=w.device, generator=generator)
         w += settings.spread * slowdown.sqrt()[:, None] * start
@@ -258,7 +246,7 @@ def _walk(
     scheduler = None if settings.schedule is None else settings.schedule(optimizer)
     gradient = _gradient(density, coordinates, w, settings.batch, generator)
     graph = any(group.get("preconditioner") for group in optimizer.param_groups)
-    kept = empty_planes(settings.draws, *shape, dtype=w.dtype, device=w.device)
+    kept = torch.empty(settings.draws, *shape, dtype=w.dtype, device=w.device)
 
     def closure() -> Tensor | None:
         if graph:  # differentiates the potential itself, and again
