@@ -95,6 +95,11 @@ def has_selection(density: Density) -> TypeGuard[SelectableDensity]:
     return hasattr(density, "select")
 
 
+def selected(density: Density, index: Int[Tensor, " chosen"]) -> Density:
+    """The windows named by ``index``, in order; the density itself where these are all, or cannot be taken apart."""
+    return density.select(index) if has_selection(density) and len(index) < density.windows else density
+
+
 def has_quick_values(density: Density) -> bool:
     """Whether its values cost many times less than its derivatives, which are then better taken from differences."""
     return getattr(density, "quick_values", False)

@@ -114,12 +114,6 @@ class Quadrature(Displayed):
             low, high = torch.where(below, middle, low), torch.where(below, high, middle)
         return (0.5 * (low + high)).exp()
 
-    def stat(self, name: str, window: int = 0) -> dict[str, float]:
-        """``{"mean", "sd", "q05", "q95"}`` of one parameter of one window."""
-        i = self.names.index(name)
-        table = {"mean": self.mean, "sd": self.sd, "q05": self.quantile(0.05), "q95": self.quantile(0.95)}
-        return {key: float(value[window, i]) for key, value in table.items()}
-
 
 def integrate(density: Density, *, mode: Mode | None = None, nodes: int = 49, tolerance: float = 0.03) -> Quadrature:
     """Integrate the posterior of every window by the trapezoid rule on a tensor grid.

@@ -12,7 +12,7 @@ from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
 from avtorch.inference.compiled import chosen
 from avtorch.inference.coordinates import Coordinates, stiffness
-from avtorch.inference.density import Density, SubsampledDensity, constrained, has_score, has_selection
+from avtorch.inference.density import Density, SubsampledDensity, constrained, has_score, has_selection, selected
 from avtorch.inference.device import check_generator
 from avtorch.inference.exactness import Exactness, compare_with_exact
 from avtorch.inference.map import Mode, find_mode
@@ -79,7 +79,7 @@ def sample(
     open_ = torch.arange(density.windows, device=mode.z.device)
     for attempt in range(settings.attempts):
         for index in _batches(density, open_, slowdown, settings.chains):
-            part, where = _select(density, index), mode.select(index)
+            part, where = selected(density, index), mode.select(index)
             times = float(_longer(slowdown[index]).amax())
             coordinates, w = _walk(part, where, settings.slower(times), slowdown[index], generator)
             fresh = torch.isin(index, open_)
@@ -122,7 +122,7 @@ def _adapted(
         return mode, slowdown
     fitted, fitted_slowdown = mode, slowdown.clone()
     for index in _batches(density, uneven, slowdown, settings.chains):
-        part, where = _select(density, index), mode.select(index)
+        part, where = selected(density, index), mode.select(index)
         # a rough covariance will do
         coordinates, w = _walk(part, where, settings.slower(PILOT), slowdown[index], generator)
         better = where.refitted(coordinates.z(w).flatten(0, 1))
@@ -177,12 +177,6 @@ def _batches(density: Density, index: Tensor, slowdown: Tensor, chains: int) -> 
             batches += few.sort().values.split(size)
             few = index[:0]
     return batches
-
-
-def _select(density: Density, index: Tensor) -> Density:
-    if len(index) == density.windows or not has_selection(density):
-        return density
-    return density.select(index)
 
 
 def _furthest(w: Float[Tensor, "chain draw window d"]) -> Float[Tensor, "window d"]:

@@ -17,9 +17,10 @@ from torch import Tensor
 
 from avtorch.arrays import FloatArray
 from avtorch.inference import Posterior, Quadrature
+from avtorch.inference.arviz_export import arviz
 from avtorch.plots.posteriors import agreement_reach, agreement_scatter, joint_cloud, marginals
 from avtorch.plots.style import BLACK, BLUE, VERMILLION, short, styled
-from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE, arviz, sampling_diagnostics
+from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE, sampling_diagnostics
 from avtorch.validation.validate import Validation
 
 #: Exact draws a window, for contours and ranks.

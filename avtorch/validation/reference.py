@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference.density import Density, constrained, has_selection
+from avtorch.inference.density import Density, constrained, selected
 from avtorch.inference.importance import RELIABLE, ImportanceSettings, weighted_draws
 from avtorch.inference.posterior import Posterior
 from avtorch.inference.quadrature import Quadrature, integrate
@@ -73,9 +73,9 @@ def exact_draws(density: Density, *, chains: int = 4, draws: int = 500, generato
     """
     count = chains * draws
     settings = ImportanceSettings(draws=2 * count, rounds=PROPOSALS // 2, enough=PROPOSALS * count)
-    found, whole = [], torch.arange(density.windows)
-    for index in whole.split(BLOCK):
-        part = density.select(index) if has_selection(density) and len(index) < len(whole) else density
+    found = []
+    for index in torch.arange(density.windows).split(BLOCK):
+        part = selected(density, index)
         weighted = weighted_draws(part, settings, generator=generator)
         kept = weighted.equal(count, generator)
         found.append((constrained(part, kept).unflatten(0, (chains, draws)), weighted.pareto_k < RELIABLE))
