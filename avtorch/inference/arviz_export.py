@@ -8,7 +8,9 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
+from torch import Tensor
 
+from avtorch.display import Frame
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,6 +36,22 @@ def shown_unit(name: str) -> str:
     return "-" if unit == "1" else unit.replace("^2", "²").replace("^3", "³").replace("sqrt(s)", "√s")
 
 
+def parameter_table(
+    place: str, names: Sequence[str], stats: Mapping[str, Tensor], flags: Mapping[str, Tensor] | None = None
+) -> Frame:
+    """A row a place (window, vehicle) and parameter: ``stats`` ``(place, parameter)``, then ``flags`` ``(place,)``."""
+    count = len(next(iter(stats.values())))
+    return Frame(
+        {
+            place: [i for i in range(count) for _ in names],
+            "parameter": list(names) * count,
+            "unit": [shown_unit(name) for name in names] * count,
+            **{key: values.flatten().tolist() for key, values in stats.items()},
+            **{key: values.repeat_interleave(len(names)).tolist() for key, values in (flags or {}).items()},
+        }
+    )
+
+
 def arviz() -> ModuleType:
     """ArviZ, or an `InputError` with the command that installs it."""
     with warnings.catch_warnings():
@@ -42,7 +60,9 @@ def arviz() -> ModuleType:
         try:
             import arviz
         except ImportError:
-            raise InputError("arviz: not installed; needs pip install 'avtorch[arviz]'") from None
+            raise InputError(
+                "arviz: not installed; needs pip install 'avtorch[arviz]' or 'avtorch[validate]'"
+            ) from None
     return arviz
 
 

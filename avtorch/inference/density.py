@@ -105,11 +105,6 @@ def has_quick_values(density: Density) -> bool:
     return getattr(density, "quick_values", False)
 
 
-def has_transform(density: Density) -> TypeGuard[ConstrainedDensity]:
-    """Whether it has another transform than ``exp``."""
-    return hasattr(density, "constrain")
-
-
 def constrained(density: Density, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
     """Parameters of ``density`` in their own units: ``exp(z)`` unless it defines another transform."""
-    return density.constrain(z) if has_transform(density) else z.exp()
+    return density.constrain(z) if isinstance(density, ConstrainedDensity) else z.exp()

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import torch
 from scipy.stats import binomtest, chi2
@@ -139,10 +139,6 @@ class Agreement:
     rhat: Tensor
     ess_bulk: Tensor
     ess_tail: Tensor
-
-    def select(self, index: Tensor) -> Agreement:
-        """The windows named by ``index``."""
-        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "names"})
 
     def within(self, *, slack: float = 0.0) -> Tensor:
         """Windows that meet the tolerance in every parameter, ``(window,)`` bool.
