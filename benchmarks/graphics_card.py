@@ -138,7 +138,7 @@ def profile(args: argparse.Namespace, into: Figures) -> None:
 
     from avtorch.inference import SamplerSettings, sample, sampler
 
-    stages = ("find_mode", "stiffness", "_walk", "nested_rhat", "_diverged", "constrained", "compare_with_exact")
+    stages = ("find_mode", "stiffness", "_walk", "_summary", "_diverged", "constrained", "compare_with_exact")
     plain = {name: getattr(sampler, name) for name in stages}
     for count in (args.sizes[len(args.sizes) // 2], args.sizes[-1]):
         spent: Counter[str] = Counter()

@@ -18,7 +18,9 @@ from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.inference.coordinates import Coordinates
 from avtorch.inference.density import Density
-from avtorch.inference.exponential_form import ExponentialForm, form_of
+from avtorch.inference.exponential_form import ExponentialForm, has_form, outdated
+from avtorch.inference.importance import tail_of
+from avtorch.inference.planes import empty_planes, to_planes
 from avtorch.inference.sampler_settings import SamplerSettings
 
 #: Steps of single chains below which a second thread costs more than it saves, some milliseconds of work.
@@ -49,7 +51,7 @@ def load_kernels(module: Literal["kernels", "latent_kernels"]) -> ModuleType | U
 
 @dataclass(frozen=True)
 class Compiled:
-    """A density whose walk the kernels can do.
+    """A density whose walk, and whose comparison with draws, the kernels can do.
 
     The law of the walk is that of :class:`~avtorch.inference.sgld.SGLD` with a constant step.
 
@@ -73,18 +75,78 @@ class Compiled:
         ``limit`` is the largest slope that a step of the burn-in follows.
         """
         chains, windows, d = start.shape
-        begin = start.permute(2, 1, 0).contiguous().numpy()
-        kept, potential = np.empty((d, windows, settings.draws, chains)), whitened(self.form, coordinates)
+        kept = empty_planes(settings.draws, chains, windows, d)
+        begin = np.ascontiguousarray(to_planes(start.detach()).numpy())
+        into, potential = to_planes(kept).numpy(), whitened(self.form, coordinates)
         key = words(generator)
 
         def go(first: int, last: int) -> None:
             steps = (settings.step, settings.noise == "averaged", settings.burn_in, settings.thinning)
-            self.kernels.walk(first, last, begin, kept, *potential, *steps, limit, *key)
+            self.kernels.walk(first, last, begin, into, *potential, *steps, limit, *key)
 
         pieces = windows * -(-chains // self.kernels.LANES)
         work = chains * windows * (settings.burn_in + settings.draws * settings.thinning)
         share(go, pieces, threads=1 if work < ALONE else torch.get_num_threads())
-        return torch.from_numpy(kept).permute(2, 3, 1, 0)
+        return kept
+
+    def summarised(
+        self, coordinates: Coordinates, w: Float[Tensor, "chain draw window 3"], groups: int, pieces: int, tail: float
+    ) -> tuple[Tensor, ...]:
+        """Of draws ``w``: nested R-hat ``(window, 3)`` by so many ``groups``, the furthest ``(window, 3)``, and what
+        :class:`~avtorch.inference.exactness.Moments` holds of ``z``."""
+        chains, _, windows, d = w.shape
+        kept = to_planes(w.transpose(0, 1)).numpy()
+        lower = np.ascontiguousarray(coordinates.lower.numpy())
+        rhat, mean, furthest = np.empty((windows, d)), np.empty((windows, d)), np.empty(windows, np.int64)
+        covariance, errors = np.empty((windows, d, d)), np.empty((windows, d, d))
+
+        def go(first: int, last: int) -> None:
+            given = (kept, lower, min(groups, chains), pieces, tail, rhat, furthest, mean, covariance, errors)
+            self.kernels.summarise(first, last, *given)
+
+        share(go, windows, threads=1 if w.numel() < ALONE else torch.get_num_threads())
+        draw, chain = np.divmod(furthest, chains)
+        far = kept[:, np.arange(windows), draw, chain].T
+        middle = coordinates.z(torch.from_numpy(mean))
+        of_draws = torch.from_numpy(errors).unbind(-1)
+        return torch.from_numpy(rhat), torch.from_numpy(far), middle, torch.from_numpy(covariance), *of_draws
+
+    def weighed(
+        self,
+        mean: Float[Tensor, "window 3"],
+        lower: Float[Tensor, "window 3 3"],
+        base: Float[Tensor, "point 3"],
+        log_proposal: Float[Tensor, " point"],
+        tail: float,
+    ) -> tuple[Tensor, ...]:
+        """Pareto-k of the importance ratios at ``mean + lower base``, ``(window,)``; weighted mean, variance and share
+        beyond ``tail``, in SDs of ``lower`` about ``mean``, and the errors of these three, each ``(window, 3)``."""
+        windows, points = len(mean), np.ascontiguousarray(to_planes(base).numpy())
+        log_ratio, found = np.empty((windows, points.shape[1])), np.empty((windows, 3, 6))
+        axes = (lower / lower.square().sum(-1, keepdim=True).sqrt()).contiguous().numpy()
+        potential = whitened(self.form, Coordinates(mean, lower))
+
+        def go(first: int, last: int) -> None:
+            given = (points, log_proposal.numpy(), axes, tail)
+            self.kernels.weigh(first, last, found, log_ratio, *given, *potential)
+
+        share(go, windows, threads=1 if log_ratio.size < ALONE else torch.get_num_threads())
+        largest, shape = torch.from_numpy(log_ratio).topk(tail_of(points.shape[1]) + 1).values, np.empty(windows)
+        self.kernels.pareto_shapes(largest.numpy(), shape)
+        return torch.from_numpy(shape), *torch.from_numpy(found).unbind(-1)
+
+    def climbed(
+        self, coordinates: Coordinates, starts: Float[Tensor, "start 3"], steps: int, stride: float
+    ) -> tuple[Float[Tensor, "start window 3"], Float[Tensor, "start window"]]:
+        """Where ascents from ``starts`` end, in ``w``, and the log density there less that at ``w = 0``."""
+        windows, lanes = len(coordinates.mode), self.kernels.LANES
+        ends, heights, begin = np.empty((windows, 3, lanes)), np.empty((windows, lanes)), np.zeros((3, lanes))
+        begin[:, : len(starts)] = starts.numpy().T
+        self.kernels.climb(
+            0, windows, ends, heights, begin.ravel(), steps, stride, *whitened(self.form, coordinates)
+        )  # fmt: skip
+        count = len(starts)
+        return torch.from_numpy(ends[:, :, :count]).permute(2, 0, 1), torch.from_numpy(heights[:, :count]).T
 
 
 def words(generator: torch.Generator | None) -> tuple[np.uint64, np.uint64]:
@@ -141,13 +203,16 @@ def chosen(density: Density, settings: SamplerSettings) -> Compiled | None:
 
 
 def compiled(density: Density) -> Compiled | Unavailable:
-    """The compiled walk of a density, or why there is none."""
+    """The compiled loops of a density, or why there are none."""
+    name = type(density).__name__
+    if not has_form(density) or outdated(density, "exponential_form"):
+        return Unavailable(f"{name} has no closed form that the kernels know")
     kernels = load_kernels("kernels")
     if isinstance(kernels, Unavailable):
         return kernels
-    form, name = form_of(density), type(density).__name__
+    form = density.exponential_form()
     if form is None:
-        return Unavailable(f"{name}, with its prior, has no closed form that the kernels know")
+        return Unavailable(f"the prior of {name} has no closed form that the kernels know")
     if form.coupling.device.type != "cpu":
         return Unavailable(f"{name} is on {form.coupling.device.type}; the kernels are for the processor")
     return Compiled(kernels, form)

@@ -11,6 +11,7 @@ from torch import Tensor
 from avtorch.arrays import Float
 from avtorch.inference.density import Density, has_score
 from avtorch.inference.map import Mode
+from avtorch.inference.planes import lower_times, lower_transposed_times
 
 Whitening = Literal["full", "diagonal", "none"]
 
@@ -78,17 +79,3 @@ def score_of(density: Density, z: Float[Tensor, "*draw window d"]) -> Float[Tens
     with torch.enable_grad():
         (score,) = torch.autograd.grad(density.log_prob(z).sum(), z)
     return score
-
-
-def lower_times(
-    lower: Float[Tensor, "window d d"], x: Float[Tensor, "*draw window d"]
-) -> Float[Tensor, "*draw window d"]:
-    """``lower @ x`` of every window."""
-    return torch.einsum("wij,...wj->...wi", lower, x)
-
-
-def lower_transposed_times(
-    lower: Float[Tensor, "window d d"], x: Float[Tensor, "*draw window d"]
-) -> Float[Tensor, "*draw window d"]:
-    """``lower.T @ x`` of every window."""
-    return torch.einsum("wji,...wj->...wi", lower, x)

@@ -22,10 +22,12 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
-from avtorch.inference.coordinates import lower_times, lower_transposed_times, score_of
+from avtorch.inference.compiled import Compiled, Unavailable, compiled
+from avtorch.inference.coordinates import Coordinates, score_of
 from avtorch.inference.density import Density, has_selection, selected
 from avtorch.inference.importance import RELIABLE, pareto_k
 from avtorch.inference.map import find_mode
+from avtorch.inference.planes import from_planes, lower_times, lower_transposed_times, to_planes
 
 MEAN_TOLERANCE, SD_TOLERANCE, TAIL_TOLERANCE = 0.1, 0.05, 0.003
 """Tolerances: error of a mean in SDs, of an SD as a ratio, of the share of draws beyond TAIL as a probability."""
@@ -161,11 +163,19 @@ class Exactness:
         return cls(**{f.name: (each[:, 0] if f.name in window else each).clone() for f in fields(cls)})
 
 
-def compare_with_exact(density: Density, z: Float[Tensor, "chain draw window parameter"]) -> Exactness:
-    """Compare draws ``z`` ``(chain, draw, window, parameter)`` with their density.
+def compare_with_exact(
+    density: Density,
+    z: Float[Tensor, "chain draw window parameter"],
+    *,
+    eager: bool = False,
+    moments: Moments | None = None,
+) -> Exactness:
+    """Compare draws ``z`` ``(chain, draw, window, parameter)``, of these ``moments`` where they are known, with their
+    density; ``eager`` without compiled loops.
 
     The first test takes few points compared with the draws; windows where it is inconclusive get about AGAIN times as
-    many, and those still undecided AGAIN times more. Windows that pass are searched for other modes.
+    many, which is where a compiled density begins, and those still undecided get AGAIN times more. Windows that pass
+    are searched for other modes.
     """
     total = z.shape[0] * z.shape[1]
     points = min(1024, max(256, total // 8))
@@ -179,17 +189,19 @@ def compare_with_exact(density: Density, z: Float[Tensor, "chain draw window par
             return everyone[where]
         return everyone if bool(where.any()) else everyone[:0]
 
-    moments = Moments.of(z)
-    found = weighed(density, moments, points)
+    moments = Moments.of(z) if moments is None else moments
+    if not eager and isinstance(compiled(density), Compiled):  # compiled points cost less than another call
+        points, *counts = counts
+    found = weighed(density, moments, points, eager=eager)
     for count in counts:
         # more points do not help where the ratios' tail is clearly heavy
         index = chosen(~(found.clear() if count == closer else found.clear() | found.sure()))
         if len(index):
-            found = found.put(index, weighed(selected(density, index), moments.select(index), count))
+            found = found.put(index, weighed(selected(density, index), moments.select(index), count, eager=eager))
     index = chosen(found.holds())
     if len(index):
         part = moments.select(index)
-        found.missed[index] = missed_mass(selected(density, index), part.mean, part.lower)
+        found.missed[index] = missed_mass(selected(density, index), part.mean, part.lower, eager=eager)
     return found
 
 
@@ -215,7 +227,7 @@ class Moments(NamedTuple):
         """Compute them from draws ``(chain, draw, window, parameter)``."""
         chains, draws = z.shape[:2]
         pieces = pieces_of(chains, draws)
-        planes = z.permute(3, 2, 1, 0)  # (parameter, window, draw, chain), contiguous as the compiled walk leaves it
+        planes = to_planes(z.transpose(0, 1))  # (parameter, window, draw, chain), contiguous as the walk leaves it
         mean = planes.mean((-2, -1))
         centred = planes - mean[..., None, None]
         flat = centred.flatten(2).movedim(0, 1)  # (window, parameter, draw x chain)
@@ -246,14 +258,19 @@ def root_of(covariance: Float[Tensor, "window d d"]) -> Float[Tensor, "window d 
     return torch.where((failed == 0)[:, None, None], lower, torch.nan)
 
 
-def weighed(density: Density, moments: Moments, points: int) -> Exactness:
+def weighed(density: Density, moments: Moments, points: int, *, eager: bool = False) -> Exactness:
     """Compare draws of these moments with their density: one call of its ``log_prob``, or a few for many windows."""
     mean, lower, share, mean_error, sd_error = moments
     base, log_proposal = (x.to(mean.device) for x in proposal(points, mean.shape[-1]))
     found = []
     size = max(1, (CARD_BLOCK if mean.is_cuda else BLOCK) // points) if has_selection(density) else len(mean)
     for part in torch.arange(len(mean), device=mean.device).split(size):
-        found.append(_weighed(selected(density, part), mean[part], lower[part], base, log_proposal))
+        chosen = selected(density, part)
+        loops = Unavailable("not asked for") if eager else compiled(chosen)
+        if isinstance(loops, Unavailable):
+            found.append(_weighed(chosen, mean[part], lower[part], base, log_proposal))
+        else:
+            found.append(loops.weighed(mean[part], lower[part], base, log_proposal, TAIL))
     k, m, variance, tail, m_error, v_error, tail_error = (torch.cat(x) for x in zip(*found, strict=True))
     spread = variance.sqrt()
     # binomial error of the tail's share, for the mean's effective number of independent draws
@@ -315,19 +332,28 @@ def proposal(points: int, d: int) -> tuple[Float[Tensor, "point d"], Float[Tenso
     square = x.square().sum(-1, keepdim=True)
     share = torch.tensor(SHARES, dtype=torch.float64).log()
     parts = share - 0.5 * square / scales.square() - d * scales.log() - 0.5 * d * math.log(2 * math.pi)
-    return x, parts.logsumexp(-1)
+    # the memory order in which the sums over points run
+    return from_planes(x.mT.contiguous()[:, None]).squeeze(1), parts.logsumexp(-1)
 
 
 def missed_mass(
-    density: Density, mean: Float[Tensor, "window parameter"], lower: Float[Tensor, "window parameter parameter"]
+    density: Density,
+    mean: Float[Tensor, "window parameter"],
+    lower: Float[Tensor, "window parameter parameter"],
+    *,
+    eager: bool = False,
 ) -> Float[Tensor, " window"]:
     """Mass of the heaviest mode found far from the draws, over that at the draws, ``(window,)``; 0 where none was.
 
-    `mean`, `lower`: the draws' mean ``(window, parameter)`` and triangular root of their covariance.
+    `mean`, `lower`: the draws' mean ``(window, parameter)`` and triangular root of their covariance. `eager`: without
+    compiled loops.
     """
-    missed = mean.new_zeros(len(mean))
+    missed, loops = mean.new_zeros(len(mean)), Unavailable("not asked for") if eager else compiled(density)
     try:
-        w, height = _climbed(density, mean, lower)
+        if isinstance(loops, Unavailable):
+            w, height = _climbed(density, mean, lower)
+        else:
+            w, height = loops.climbed(Coordinates(mean, lower), starts(mean.shape[-1]), STEPS, STRIDE)
     except ValueError:  # a user's function that raises this far out: no search ends there
         return missed
     high = (w.square().sum(-1) > FAR**2) & (height > -DEPTH)

@@ -10,7 +10,7 @@ is of this form, with every prior of :mod:`avtorch.inference.priors`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, TypeGuard, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -104,12 +104,18 @@ class ExponentialForm:
         )
 
 
-def form_of(density: Density) -> ExponentialForm | None:
-    """Minus the log density in this form, from the density's method ``exponential_form``; ``None`` where it has none,
-    where its prior is not of this form, or where a subclass has another density than the parent that has the form."""
-    if not hasattr(density, "exponential_form") or outdated(density, "exponential_form"):
-        return None
-    return density.exponential_form()  # pyright: ignore[reportAttributeAccessIssue]
+@runtime_checkable
+class ExponentialDensity(Density, Protocol):
+    """A density that is of the module's form, so that its walk can be compiled."""
+
+    def exponential_form(self) -> ExponentialForm | None:
+        """Minus its log density; ``None`` where its prior is not of this form."""
+        ...
+
+
+def has_form(density: Density) -> TypeGuard[ExponentialDensity]:
+    """Whether it is an :class:`ExponentialDensity`."""
+    return hasattr(density, "exponential_form")
 
 
 def terms_of(prior: Any, windows: int) -> PotentialTerms | None:

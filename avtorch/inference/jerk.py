@@ -11,6 +11,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float, Int, Real
 from avtorch.inference.device import Device
 from avtorch.inference.exponential_form import ExponentialForm, terms_of
+from avtorch.inference.planes import as_planes, from_planes, to_planes
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior, prior_on
 from avtorch.vehicle.glvd import glvd_jerk
 
@@ -125,6 +126,10 @@ class JerkDensity:
         self._half_form = 0.5 * torch.stack([torch.stack(row, -1) for row in rows], -2)
         # made when asked for: the prior that it was made with, and the form
         self._form: tuple[Prior, ExponentialForm] | None = None
+        if len(s.n) == 1:
+            self._form_of_one = 2 * self._half_form[0]
+            self._points_of_one = -s.n * _LOG_SCALED.new_tensor([[0.0], [0.0], [1.0]]).to(s.n.device)
+            self._log_scaled = _LOG_SCALED.to(s.n.device)
 
     @property
     def windows(self) -> int:
@@ -164,7 +169,9 @@ class JerkDensity:
         return form
 
     def score(self, z: Float[Tensor, "*draw window 3"]) -> Float[Tensor, "*draw window 3"]:
-        """Gradient of :meth:`log_prob` in ``z``, in closed form."""
+        """Gradient of :meth:`log_prob` in ``z``, in closed form, parameter by parameter (see :func:`as_planes`)."""
+        if self.windows == 1:
+            return self._score_of_one(z)
         log_T, log_K, log_sigma = z.unbind(-1)
         s = self.statistics
         # (1, 1/T, K/T) / sigma, then half the chi2 differentiated by their logarithms
@@ -177,7 +184,15 @@ class JerkDensity:
         by_lag += by_gain
         by_one += by_lag
         by_one -= s.n
-        return torch.stack([by_lag, -by_gain, by_one], -1).add_(self.prior.score(z))
+        return as_planes(by_lag, -by_gain, by_one).add_(self.prior.score(z))
+
+    def _score_of_one(self, z: Tensor) -> Tensor:
+        """:meth:`score` of a single window in three products, where every call counts."""
+        planes = to_planes(z)
+        scaled = (self._log_scaled @ planes.reshape(3, -1)).exp_()
+        by_log = (self._form_of_one @ scaled).mul_(scaled)
+        score = torch.addmm(self._points_of_one, self._log_scaled.T, by_log, alpha=-1)
+        return from_planes(score.view(planes.shape)).add_(self.prior.score(z))
 
     def initial(self) -> Float[Tensor, "window 3"]:
         """Least squares where it gives positive values near the plausible range, else the prior's centre."""

@@ -7,13 +7,12 @@ For potentials of exponential form (:mod:`avtorch.inference.exponential_form`) g
     \nabla^2 U = Q + E^\top (\mathrm{diag}(e)\, C\, \mathrm{diag}(e) + \mathrm{diag}(e \circ C e)) E
                  + \mathrm{diag}(a e^z + 2 s e^{2z})
 
-The search is in NumPy, on the processor: for a window or two, as a live watch has them, the calls are all that it
-costs, and a call of NumPy's takes a quarter of the time of one of torch's.
+and the search is in NumPy: for a window or two, as a live watch has them, the calls are all that it costs, and a call
+of NumPy's takes a quarter of the time of one of torch's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,13 +21,13 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, BoolArray, Float, FloatArray, Int
 from avtorch.inference.density import Density, ScoredDensity, has_quick_values, has_score
-from avtorch.inference.exponential_form import ExponentialForm, form_of
+from avtorch.inference.exponential_form import ExponentialForm, has_form, outdated
 
 FLAT = 1e-6
 """Least curvature that a step assumes, so that a flat direction does not become an endless step."""
 
-Expansion = tuple[FloatArray, FloatArray, FloatArray]
-"""Potential ``(window,)``, gradient ``(window, d)`` and Hessian ``(window, d, d)`` at ``z`` ``(window, d)``."""
+EIGEN_BATCH = 10_000
+"""Matrices decomposed at once: so many pass on a graphics card, 100,000 ended in an internal error of cuSOLVER's."""
 
 
 @dataclass(frozen=True)
@@ -102,53 +101,38 @@ def find_mode(
         True
     """
     from_values = has_quick_values(density) if from_values is None else from_values
-    z = (density.initial() if start is None else start).detach()
-    form = form_of(density) if not from_values and z.device.type == "cpu" and z.dtype == torch.float64 else None
-
-    def expand(at: FloatArray) -> Expansion:
-        given = torch.from_numpy(at).to(z)
-        if from_values:
-            found = _from_values(density, given)
-        elif has_score(density) and not has_quick_values(density):
-            found = _from_score(density, given)
-        else:
-            found = _from_graph(density, given)
-        potential, gradient, hessian = (x.cpu().numpy() for x in found)
-        return potential, gradient, hessian
-
-    at, found = _ascended(expand if form is None else _of_form(form), z.cpu().numpy(), iterations, tolerance)
-    mode, potential, gradient, hessian = (torch.from_numpy(x) for x in (at, *found))
-    eigenvalues, basis = torch.linalg.eigh(hessian)
+    z = (density.initial() if start is None else start).detach().clone()
+    form = None if from_values else _form(density, z)
+    if form is not None:
+        z, potential, gradient, hessian = (torch.from_numpy(x) for x in _ascend(form, z, iterations, tolerance))
+    else:
+        z, potential, gradient, hessian = _search(density, z, iterations, tolerance, from_values)
+    eigenvalues, basis = _eigh(hessian)
     decrement = 0.5 * (torch.einsum("wij,wi->wj", basis, gradient).square() / eigenvalues.abs().clamp_min(FLAT)).sum(-1)
     converged = (eigenvalues > 0).all(-1) & (decrement < 1e-4) & potential.isfinite()
     root = basis * eigenvalues.abs().clamp_min(FLAT).rsqrt().unsqueeze(-2)
     # its triangular form without squaring it, which would lose half the digits of a narrow posterior
     scale = torch.linalg.qr(root.mT, mode="r").R.mT
-    return Mode(*(x.to(z.device) for x in (mode, scale, -potential, converged)))
+    return Mode(z, scale, -potential, converged)
 
 
-def _ascended(
-    expand: Callable[[FloatArray], Expansion], at: FloatArray, iterations: int, tolerance: float
-) -> tuple[FloatArray, Expansion]:
-    """The mode ``(window, d)``, and potential, gradient and Hessian there, as ``find_mode`` has them at the end of its
-    search from ``at``."""
+def _form(density: Density, z: Tensor) -> ExponentialForm | None:
+    """The density in closed form, where it has one and the search runs in NumPy."""
+    if z.device.type != "cpu" or z.dtype != torch.float64 or not has_form(density):
+        return None
+    return None if outdated(density, "exponential_form") else density.exponential_form()
 
-    def sound(z: FloatArray) -> Expansion:
-        """Infinite, zero and the identity where one of the three is not finite."""
-        potential, gradient, hessian = expand(z)
-        hessian = 0.5 * (hessian + hessian.transpose(0, 2, 1))
-        if bool(np.isfinite(potential + gradient.sum(-1) + hessian.sum((-2, -1))).all()):
-            return potential, gradient, hessian
-        good = np.isfinite(potential) & np.isfinite(gradient).all(-1) & np.isfinite(hessian).all((-2, -1))
-        return (
-            np.where(good, potential, np.inf),
-            np.where(good[:, None], gradient, 0.0),
-            np.where(good[:, None, None], hessian, np.eye(z.shape[-1])),
-        )
 
+def _ascend(
+    form: ExponentialForm, z: Float[Tensor, "window 3"], iterations: int, tolerance: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The mode ``(window, 3)``, and potential ``(window,)``, gradient ``(window, 3)`` and Hessian ``(window, 3, 3)``
+    there, as ``find_mode`` has them at the end of its search from ``z``."""
+    expand = _Expansion(form)
+    at = z.numpy().copy()
     damping = np.ones(len(at))
-    with np.errstate(all="ignore"):  # what overflows is refused by `sound`
-        potential, gradient, hessian = sound(at)
+    with np.errstate(all="ignore"):  # what overflows is refused by `_Expansion`
+        potential, gradient, hessian = expand(at)
         for _ in range(iterations):
             eigenvalues, basis = np.linalg.eigh(hessian)
             curvature = np.maximum(np.abs(eigenvalues), FLAT)
@@ -159,38 +143,108 @@ def _ascended(
             step = -(basis @ along[..., None])[..., 0]
             step /= np.maximum(np.abs(step).max(-1, keepdims=True), 1.0)
             trial = at + damping[:, None] * step
-            new = sound(trial)
+            new = expand(trial)
             better: BoolArray = new[0] <= potential
+            if bool(better.all()):
+                at, (potential, gradient, hessian) = trial, new
+                damping = np.minimum(2 * damping, 1.0)
+                continue
             at = np.where(better[:, None], trial, at)
             potential = np.where(better, new[0], potential)
             gradient = np.where(better[:, None], new[1], gradient)
             hessian = np.where(better[:, None, None], new[2], hessian)
             damping = np.where(better, np.minimum(2 * damping, 1.0), 0.25 * damping)
-    return at, (potential, gradient, hessian)
+    return at, potential, gradient, hessian
 
 
-def _of_form(form: ExponentialForm) -> Callable[[FloatArray], Expansion]:
-    """The potential of a form and its derivatives, as functions of ``z`` ``(window, 3)``."""
-    t, exponents, offsets, coupling = form.terms, form.exponents.numpy(), form.offsets.numpy(), form.coupling.numpy()
-    constant, linear, quadratic, own_linear, own_square = (
-        x.numpy() for x in (t.constant, t.linear, t.quadratic, t.own_linear, t.own_square)
-    )
-    diagonal = np.arange(len(exponents))
+class _Expansion:
+    """Potential, gradient and Hessian of a form at ``z`` ``(window, 3)``; infinite, zero and the identity where one of
+    them is not finite."""
 
-    def expand(z: FloatArray) -> Expansion:
-        e, own = np.exp(z @ exponents.T + offsets), np.exp(z)
-        bent = (quadratic @ z[..., None])[..., 0]
-        pulled = e * (coupling @ e[..., None])[..., 0]
-        first, second = own_linear * own, own_square * own * own
-        potential = constant + ((linear + 0.5 * bent) * z + 0.5 * pulled + first + 0.5 * second).sum(-1)
-        gradient = linear + bent + pulled @ exponents + first + second
-        inner = coupling * (e[:, :, None] * e[:, None, :])
+    def __init__(self, form: ExponentialForm) -> None:
+        t = form.terms
+        self.constant, self.linear, self.quadratic = t.constant.numpy(), t.linear.numpy(), t.quadratic.numpy()
+        self.own_linear, self.own_square = t.own_linear.numpy(), t.own_square.numpy()
+        self.exponents, self.offsets = form.exponents.numpy(), form.offsets.numpy()
+        self.coupling = form.coupling.numpy()
+
+    def __call__(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        e, own = np.exp(z @ self.exponents.T + self.offsets), np.exp(z)
+        bent = (self.quadratic @ z[..., None])[..., 0]
+        pulled = e * (self.coupling @ e[..., None])[..., 0]
+        first, second = self.own_linear * own, self.own_square * own * own
+        potential = self.constant + ((self.linear + 0.5 * bent) * z + 0.5 * pulled + first + 0.5 * second).sum(-1)
+        gradient = self.linear + bent + pulled @ self.exponents + first + second
+        inner = self.coupling * (e[:, :, None] * e[:, None, :])
+        diagonal = np.arange(z.shape[-1])
         inner[:, diagonal, diagonal] += pulled
-        hessian = quadratic + exponents.T @ inner @ exponents
+        hessian = self.quadratic + self.exponents.T @ inner @ self.exponents
         hessian[:, diagonal, diagonal] += first + 2 * second
-        return potential, gradient, hessian
+        hessian = 0.5 * (hessian + hessian.transpose(0, 2, 1))
+        sums = potential + gradient.sum(-1) + hessian.sum((-2, -1))
+        if bool(np.isfinite(sums).all()):
+            return potential, gradient, hessian
+        good = np.isfinite(potential) & np.isfinite(gradient).all(-1) & np.isfinite(hessian).all((-2, -1))
+        return (
+            np.where(good, potential, np.inf),
+            np.where(good[:, None], gradient, 0.0),
+            np.where(good[:, None, None], hessian, np.eye(z.shape[-1])),
+        )
 
-    return expand
+
+def _search(
+    density: Density, z: Tensor, iterations: int, tolerance: float, from_values: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Where the search from ``z`` ends, and potential, gradient and Hessian there."""
+    damping = torch.ones_like(z[:, 0])
+    potential, gradient, hessian = _expand(density, z, from_values)
+    for _ in range(iterations):
+        eigenvalues, basis = _eigh(hessian)
+        # the floor keeps a flat direction from becoming an endless step
+        curvature = eigenvalues.abs().clamp_min(FLAT)
+        projected = torch.einsum("wij,wi->wj", basis, gradient)
+        decrement = 0.5 * (projected.square() / curvature).sum(-1)
+        if bool((decrement < tolerance).all()):
+            break
+        step = -torch.einsum("wij,wj->wi", basis, projected / curvature)
+        step = step / step.abs().amax(-1, keepdim=True).clamp_min(1.0)
+        trial = z + damping[:, None] * step
+        new_potential, new_gradient, new_hessian = _expand(density, trial, from_values)
+        better = new_potential <= potential
+        z = torch.where(better[:, None], trial, z)
+        potential = torch.where(better, new_potential, potential)
+        gradient = torch.where(better[:, None], new_gradient, gradient)
+        hessian = torch.where(better[:, None, None], new_hessian, hessian)
+        damping = torch.where(better, (2 * damping).clamp_max(1.0), 0.25 * damping)
+    return z, potential, gradient, hessian
+
+
+def _eigh(hessian: Float[Tensor, "window d d"]) -> tuple[Float[Tensor, "window d"], Float[Tensor, "window d d"]]:
+    if len(hessian) <= EIGEN_BATCH:
+        return torch.linalg.eigh(hessian)
+    values, basis = zip(*(torch.linalg.eigh(part) for part in hessian.split(EIGEN_BATCH)), strict=True)
+    return torch.cat(values), torch.cat(basis)
+
+
+def _expand(
+    density: Density, z: Float[Tensor, "window d"], from_values: bool
+) -> tuple[Float[Tensor, " window"], Float[Tensor, "window d"], Float[Tensor, "window d d"]]:
+    """Potential ``(window,)``, gradient ``(window, d)`` and Hessian ``(window, d, d)``; infinite where not defined."""
+    z = z.detach()
+    if from_values:
+        potential, gradient, hessian = _from_values(density, z)
+    elif has_score(density) and not has_quick_values(density):
+        potential, gradient, hessian = _from_score(density, z)
+    else:
+        potential, gradient, hessian = _from_graph(density, z)
+    hessian = 0.5 * (hessian + hessian.mT)
+    good = potential.isfinite() & gradient.isfinite().all(-1) & hessian.isfinite().flatten(1).all(-1)
+    eye = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
+    return (
+        torch.where(good, potential, torch.inf),
+        torch.where(good[:, None], gradient, 0.0),
+        torch.where(good[:, None, None], hessian, eye),
+    )
 
 
 def _from_score(density: ScoredDensity, z: Tensor, spacing: float = 1e-5) -> tuple[Tensor, Tensor, Tensor]:

@@ -16,6 +16,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.exponential_form import PotentialTerms, terms_of
+from avtorch.inference.planes import join_planes
 from avtorch.vehicle.arguments import broadcast_shape
 
 _LOG_2PI = math.log(2 * math.pi)
@@ -262,7 +263,7 @@ class Joint:
         return self.actuation.log_prob(z[..., :2]) + self.noise.log_prob(z[..., 2:])
 
     def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
-        return torch.cat([self.actuation.score(z[..., :2]), self.noise.score(z[..., 2:])], -1)
+        return join_planes(self.actuation.score(z[..., :2]), self.noise.score(z[..., 2:]))
 
     def potential_terms(self, windows: int) -> PotentialTerms | None:
         first, rest = terms_of(self.actuation, windows), terms_of(self.noise, windows)

@@ -12,8 +12,9 @@ from avtorch.inference.compiled import chosen
 from avtorch.inference.coordinates import Coordinates, score_of, stiffness
 from avtorch.inference.density import Density, SubsampledDensity, constrained, has_selection, selected
 from avtorch.inference.device import check_generator
-from avtorch.inference.exactness import Exactness, compare_with_exact
+from avtorch.inference.exactness import TAIL, Exactness, Moments, compare_with_exact, pieces_of, root_of
 from avtorch.inference.map import Mode, find_mode
+from avtorch.inference.planes import empty_planes
 from avtorch.inference.posterior import Posterior, nested_rhat
 from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.inference.sgld import SGLD
@@ -82,14 +83,17 @@ def sample(
             coordinates, w = _walk(part, where, settings.slower(times), slowdown[index], generator)
             fresh = torch.isin(index, open_)
             new = index[fresh]
-            diverged[new] = _diverged(part, where, coordinates.z(_furthest(w)))[fresh]
-            unmixed[new] = ~(nested_rhat(w).amax(-1) <= limit)[fresh]  # NaN counts as not converged
+            rhat, far, moments = _summary(part, settings, coordinates, w)
+            diverged[new] = _diverged(part, where, coordinates.z(far))[fresh]
+            unmixed[new] = ~(rhat.amax(-1) <= limit)[fresh]  # NaN counts as not converged
             stuck[new] = (slowdown[new] > STUCK) | _too_wide(where, settings, slowdown[index], times)[fresh]
             z = coordinates.z(w)
             values = constrained(density, z)
             draws[:, :, new] = values if len(new) == len(index) else values[:, :, fresh]
             if settings.compare:
-                found = found.put(index, compare_with_exact(part, z), fresh)
+                found = found.put(
+                    index, compare_with_exact(part, z, eager=settings.walk == "eager", moments=moments), fresh
+                )
         slowdown = 2 * slowdown
         again = diverged | unmixed
         if settings.compare:
@@ -177,11 +181,19 @@ def _batches(density: Density, index: Tensor, slowdown: Tensor, chains: int) -> 
     return batches
 
 
-def _furthest(w: Float[Tensor, "chain draw window d"]) -> Float[Tensor, "window d"]:
-    """The draw of each window that is furthest from 0, ``(window, d)``."""
-    flat = w.transpose(0, 1).flatten(0, 1)  # in the order of memory
-    index = flat.square().sum(-1).nan_to_num_(nan=torch.inf).argmax(0)
-    return flat[index, torch.arange(w.shape[2], device=w.device)]
+def _summary(
+    density: Density, settings: SamplerSettings, coordinates: Coordinates, w: Float[Tensor, "chain draw window d"]
+) -> tuple[Float[Tensor, "window d"], Float[Tensor, "window d"], Moments | None]:
+    """Nested R-hat of draws, the furthest of each window, ``(window, d)`` both, and their moments if compiled."""
+    chains, draws, windows, _ = w.shape
+    loops = chosen(density, settings)
+    if loops is not None:
+        rhat, far, mean, covariance, *rest = loops.summarised(coordinates, w, 8, pieces_of(chains, draws), TAIL)
+        return rhat, far, Moments(mean, root_of(covariance), *rest)
+    distance = w.square().sum(-1).nan_to_num_(nan=torch.inf)
+    furthest = distance.transpose(0, 1).flatten(0, 1).argmax(0)  # in the order of memory
+    far = w.transpose(0, 1).flatten(0, 1)[furthest, torch.arange(windows, device=w.device)]
+    return nested_rhat(w), far, None
 
 
 def _diverged(
@@ -221,7 +233,7 @@ def _walk(
     # each window's own step is folded into its scale
     coordinates = Coordinates.of(mode, settings.whitening).slowed(slowdown)
     shape = (settings.chains, *mode.z.shape)
-    w = torch.zeros(shape, dtype=mode.z.dtype, device=mode.z.device)
+    w = empty_planes(*shape, dtype=mode.z.dtype, device=mode.z.device).zero_()
     if settings.spread > 0:
         start = torch.randn(shape, dtype=w.dtype, device=w.device, generator=generator)
         w += settings.spread * slowdown.sqrt()[:, None] * start
@@ -238,7 +250,7 @@ def _walk(
     scheduler = None if settings.schedule is None else settings.schedule(optimizer)
     state = w.detach()
     graph = any(group.get("preconditioner") for group in optimizer.param_groups)
-    kept = torch.empty(settings.draws, *shape, dtype=w.dtype, device=w.device)
+    kept = empty_planes(settings.draws, *shape, dtype=w.dtype, device=w.device)
 
     def closure() -> Tensor | None:
         if graph:  # differentiates the potential itself, and again

@@ -18,8 +18,9 @@ from avtorch.inference import (
 from avtorch.inference import compiled as module
 from avtorch.inference.compiled import words
 from avtorch.inference.coordinates import Coordinates
-from avtorch.inference.exactness import Moments, weighed
-from avtorch.inference.sampler import walk
+from avtorch.inference.exactness import Moments, missed_mass, weighed
+from avtorch.inference.planes import empty_planes
+from avtorch.inference.sampler import _summary, walk
 from tests.bars import BAR
 from tests.inference.compiled_cases import KINDS, Gaussian, densities, generator, walk_noise
 
@@ -165,13 +166,52 @@ def test_a_chain_does_not_depend_on_how_many_there_are(make_windows):
     assert torch.equal(many[:33], few)
 
 
+def test_the_check_of_the_draws_is_the_eager_check(make_windows):
+    """To the round-off of a log density of 1e4 nats in importance weights."""
+    for density in densities(make_windows).values():
+        mode = find_mode(density)
+        normal = torch.randn(64, 20, 3, 3, 1, generator=generator(1), dtype=F64)
+        moments = Moments.of(mode.z + (mode.scale @ normal)[..., 0])
+        quick, eager = (weighed(density, moments, 512, eager=eager) for eager in (False, True))
+        for name in quick.__dataclass_fields__:
+            torch.testing.assert_close(getattr(quick, name), getattr(eager, name), rtol=1e-6, atol=1e-7, msg=name)
+
+
+@pytest.mark.parametrize(("chains", "draws"), [(320, 8), (5, 9), (1, 40)])
+def test_the_summary_of_the_draws_is_the_eager_summary(chains, draws, make_windows):
+    """R-hat, the furthest draw, and moments with their errors, also of draws that are no numbers."""
+    for density in densities(make_windows).values():
+        coordinates = Coordinates.of(find_mode(density))
+        w = empty_planes(draws, chains, 3, 3).transpose(0, 1)
+        w[:] = torch.randn(chains, draws, 3, 3, generator=generator(2), dtype=F64)
+        w[0, 1, 2] = torch.nan
+        ways = (SamplerSettings(chains=chains, draws=draws, walk=way) for way in ("compiled", "eager"))
+        (rhat, far, moments), (other_rhat, other_far, _) = (_summary(density, s, coordinates, w) for s in ways)
+        assert bool(rhat[2].isnan().all())
+        pairs = zip((rhat, far, *moments), (other_rhat, other_far, *Moments.of(coordinates.z(w))), strict=True)
+        for mine, other in pairs:
+            torch.testing.assert_close(mine, other, rtol=1e-9, atol=1e-12, equal_nan=True)
+
+
+def test_the_search_for_missed_modes_is_the_eager_search(make_windows):
+    """Also where it finds something: of draws that stand aside, the posterior's own mode is a missed one."""
+    for density in densities(make_windows).values():
+        mode = find_mode(density)
+        for mean in (mode.z, mode.z + 8 * mode.scale[..., 0]):
+            mine, other = (missed_mass(density, mean, mode.scale, eager=eager) for eager in (False, True))
+            torch.testing.assert_close(mine, other, rtol=1e-6, atol=1e-12)
+        assert float(mine.max()) > 1
+
+
 def test_points_without_density_weigh_nothing(make_windows):
-    """A mean that is no number: nothing may be claimed, and nothing may fail."""
+    """A mean that is no number: neither way may claim anything, and neither may fail."""
     density = densities(make_windows)["first"]
     mode = find_mode(density)
     moments = Moments.of((mode.z + torch.randn(64, 20, 3, 3, generator=generator(1), dtype=F64)).clone())
     moments.mean[1] = torch.nan
-    assert weighed(density, moments, 256).known().tolist()[1] is False
+    for eager in (False, True):
+        found = weighed(density, moments, 256, eager=eager)
+        assert found.known().tolist()[1] is False, eager
 
 
 def test_coordinates_reach_the_kernels_whole(make_windows):
