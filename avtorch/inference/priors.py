@@ -53,6 +53,8 @@ class LogNormalPrior:
 
     median: Float[Tensor, " parameter"]
     log_sd: Float[Tensor, " parameter"]
+    _log_median: Float[Tensor, " parameter"] = field(init=False, repr=False)
+    _precision: Float[Tensor, " parameter"] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("median", "log_sd"):
@@ -60,19 +62,21 @@ class LogNormalPrior:
             if not bool((value > 0).all()):
                 raise InputError(f"{name}: {value.tolist()} is not positive")
             object.__setattr__(self, name, value)
+        object.__setattr__(self, "_log_median", self.median.log())
+        object.__setattr__(self, "_precision", self.log_sd.square().reciprocal())
 
     def log_prob(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw"]:
         score = (z - self.median.log()) / self.log_sd
         return -0.5 * score.square().sum(-1) - self.log_sd.log().sum() - 0.5 * len(self.median) * _LOG_2PI
 
     def score(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
-        return (self.median.log() - z) / self.log_sd.square()
+        return (self._log_median - z).mul_(self._precision)
 
     def potential_terms(self, windows: int) -> PotentialTerms:
-        center, precision = self.median.log(), self.log_sd.square().reciprocal()
-        constant = 0.5 * (precision * center.square()).sum() + self.log_sd.log().sum() + 0.5 * len(center) * _LOG_2PI
-        linear, quadratic = -precision * center, precision.diag()
-        return PotentialTerms.of(windows, len(center), constant=constant, linear=linear, quadratic=quadratic)
+        half = 0.5 * (self._precision * self._log_median.square()).sum()
+        constant = half + self.log_sd.log().sum() + 0.5 * len(self.median) * _LOG_2PI
+        linear, quadratic = -self._precision * self._log_median, self._precision.diag()
+        return PotentialTerms.of(windows, len(self.median), constant=constant, linear=linear, quadratic=quadratic)
 
     @property
     def device(self) -> torch.device:
@@ -99,23 +103,25 @@ class HalfNormalPrior:
     """Independent half-normal parameters with the given ``scale``, shape ``(parameter,)``."""
 
     scale: Float[Tensor, " parameter"]
+    _minus_precision: Float[Tensor, " parameter"] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         value = torch.as_tensor(self.scale, dtype=torch.float64)
         if not bool((value > 0).all()):
             raise InputError(f"scale: {value.tolist()} is not positive")
         object.__setattr__(self, "scale", value)
+        object.__setattr__(self, "_minus_precision", -value.square().reciprocal())
 
     def log_prob(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw"]:
         log_density = -0.5 * (z.exp() / self.scale).square() + z
         return log_density.sum(-1) + len(self.scale) * 0.5 * math.log(2 / math.pi) - self.scale.log().sum()
 
     def score(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
-        return 1 - (z.exp() / self.scale).square()
+        return (2 * z).exp_().mul_(self._minus_precision).add_(1)
 
     def potential_terms(self, windows: int) -> PotentialTerms:
         constant = self.scale.log().sum() - len(self.scale) * 0.5 * math.log(2 / math.pi)
-        square = self.scale.square().reciprocal()
+        square = -self._minus_precision
         return PotentialTerms.of(windows, len(self.scale), constant=constant, linear=-1.0, own_square=square)
 
     @property
