@@ -23,7 +23,6 @@ from avtorch.inference.priors import Prior
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.inference.sequential import CarriedBy, SequentialInference
-from avtorch.validation.windows import Amplitude, statistics
 from benchmarks.rank_calibration import (
     LEVELS,
     RankCalibration,
@@ -33,6 +32,7 @@ from benchmarks.rank_calibration import (
     joined,
     sbc_quadrature,
 )
+from benchmarks.sine_windows import Amplitude, statistics
 
 LEVEL, SEED = 0.01, 20240601
 STRONG, WEAK, VARIED = 1.0, 0.1, (0.1, 2.0)

@@ -31,7 +31,7 @@ from avtorch.inference.priors import Joint, Prior, default_actuation_prior, defa
 from avtorch.inference.quadrature import Quadrature, integrate
 from avtorch.inference.sampler import SamplerSettings
 from avtorch.inference.sequential import CarriedBy, SequentialInference
-from avtorch.validation.windows import Amplitude, statistics
+from benchmarks.sine_windows import Amplitude, statistics
 
 SEED, AMPLITUDES = 20240602, (1.0, 0.3, 0.1)
 NAMES = ("T_L", "K_L", "sigma")

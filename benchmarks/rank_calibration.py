@@ -24,7 +24,7 @@ from avtorch.errors import InputError
 from avtorch.inference.jerk import JerkDensity
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
 from avtorch.inference.quadrature import integrate
-from avtorch.validation.windows import Amplitude, statistics
+from benchmarks.sine_windows import Amplitude, statistics
 from benchmarks.uniformity import bonferroni, chi2_p_value, dispersion_p_value, ecdf_band, ecdf_p_value
 
 LEVELS = (0.5, 0.9, 0.95)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
+from torch import Tensor
 
+from avtorch.display import Frame
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,6 +36,36 @@ def shown_unit(name: str) -> str:
     return "-" if unit == "1" else unit.replace("^2", "²").replace("^3", "³").replace("sqrt(s)", "√s")
 
 
+def parameter_table(
+    place: str, names: Sequence[str], stats: Mapping[str, Tensor], flags: Mapping[str, Tensor] | None = None
+) -> Frame:
+    """A row a place (window, vehicle) and parameter: ``stats`` ``(place, parameter)``, then ``flags`` ``(place,)``."""
+    count = len(next(iter(stats.values())))
+    return Frame(
+        {
+            place: [i for i in range(count) for _ in names],
+            "parameter": list(names) * count,
+            "unit": [shown_unit(name) for name in names] * count,
+            **{key: values.flatten().tolist() for key, values in stats.items()},
+            **{key: values.repeat_interleave(len(names)).tolist() for key, values in (flags or {}).items()},
+        }
+    )
+
+
+def arviz() -> ModuleType:
+    """ArviZ, or an `InputError` with the command that installs it."""
+    with warnings.catch_warnings():
+        # ArviZ 0.23 announces its successor on import
+        warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major refactor", FutureWarning)
+        try:
+            import arviz
+        except ImportError:
+            raise InputError(
+                "arviz: not installed; needs pip install 'avtorch[arviz]' or 'avtorch[validate]'"
+            ) from None
+    return arviz
+
+
 def inference_data(
     draws: Mapping[str, NDArray],
     dims: Sequence[str],
@@ -49,16 +82,11 @@ def inference_data(
     """
     if not all(x.size for x in draws.values()) or not draws:
         raise InputError("draws: found none; to_arviz needs posterior draws")
-    with warnings.catch_warnings():
-        # ArviZ 0.23 announces its successor on import
-        warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major refactor", FutureWarning)
-        try:
-            import arviz
-            import xarray
-        except ImportError:
-            raise InputError("arviz: not installed; to_arviz needs pip install 'avtorch[arviz]'") from None
+    az = arviz()
+    import xarray
+
     variables = {name: (dims, x, {"units": units[name]} if name in units else {}) for name, x in draws.items()}
     sizes = zip(dims, next(iter(draws.values())).shape, strict=True)
     coords = {dim: range(size) for dim, size in sizes}
     attrs = {"inference_library": "avtorch", **attributes}
-    return arviz.InferenceData(posterior=xarray.Dataset(variables, coords=coords, attrs=attrs))
+    return az.InferenceData(posterior=xarray.Dataset(variables, coords=coords, attrs=attrs))

@@ -11,7 +11,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float, Int
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
-from avtorch.inference.arviz_export import UNITS, shown_unit
+from avtorch.inference.arviz_export import UNITS, inference_data, parameter_table
 from avtorch.inference.device import Device
 from avtorch.inference.posterior import quantile_of
 from avtorch.inference.priors import Prior
@@ -92,16 +92,8 @@ class Belief(Displayed):
 
     def summary(self) -> Frame:
         """A row a vehicle and parameter: mean, sd, the 5 and 95 % quantiles; `used`: the window updated it."""
-        vehicles, count = len(self.excited), len(self.names)
-        return Frame(
-            {
-                "vehicle": [v for v in range(vehicles) for _ in self.names],
-                "parameter": list(self.names) * vehicles,
-                "unit": [shown_unit(name) for name in self.names] * vehicles,
-                **{key: getattr(self, key).flatten().tolist() for key in ("mean", "sd", "q05", "q95")},
-                "used": (self.excited & self.converged).repeat_interleave(count).tolist(),
-            }
-        )
+        stats = {key: getattr(self, key) for key in ("mean", "sd", "q05", "q95")}
+        return parameter_table("vehicle", self.names, stats, {"used": self.excited & self.converged})
 
     def to_dataframe(self) -> pandas.DataFrame:
         """The draws, a row a draw and vehicle, a column a parameter. Needs ``pip install 'avtorch[pandas]'``."""
@@ -118,8 +110,6 @@ class Belief(Displayed):
 
         The draws of a belief are independent or thinned: R-hat of one chain says nothing, see :meth:`Posterior.rhat`.
         """
-        from avtorch.inference.arviz_export import inference_data
-
         draws = {name: self.draws[..., i].unsqueeze(0).cpu().numpy() for i, name in enumerate(self.names)}
         attributes = {"used": (self.excited & self.converged).int().tolist()}
         return inference_data(draws, ("chain", "draw", "vehicle"), units=UNITS, attributes=attributes)

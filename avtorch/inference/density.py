@@ -95,16 +95,16 @@ def has_selection(density: Density) -> TypeGuard[SelectableDensity]:
     return hasattr(density, "select")
 
 
+def selected(density: Density, index: Int[Tensor, " chosen"]) -> Density:
+    """The windows named by ``index``, in order; the density itself where these are all, or cannot be taken apart."""
+    return density.select(index) if has_selection(density) and len(index) < density.windows else density
+
+
 def has_quick_values(density: Density) -> bool:
     """Whether its values cost many times less than its derivatives, which are then better taken from differences."""
     return getattr(density, "quick_values", False)
 
 
-def has_transform(density: Density) -> TypeGuard[ConstrainedDensity]:
-    """Whether it has another transform than ``exp``."""
-    return hasattr(density, "constrain")
-
-
 def constrained(density: Density, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
     """Parameters of ``density`` in their own units: ``exp(z)`` unless it defines another transform."""
-    return density.constrain(z) if has_transform(density) else z.exp()
+    return density.constrain(z) if isinstance(density, ConstrainedDensity) else z.exp()

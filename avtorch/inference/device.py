@@ -6,11 +6,7 @@ Densities follow the tensors that they are made of, and samplers and integrals t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
-from torch import Tensor
 
 from avtorch.errors import InputError, quoted
 
@@ -41,12 +37,3 @@ def check_generator(generator: torch.Generator | None, device: torch.device) -> 
     """Raises `InputError` for a generator of another device."""
     if generator is not None and generator.device.type != device.type:
         raise InputError(f"generator: found one on {generator.device}, needs one on {device}, where the density is")
-
-
-def on_host(state: Any) -> Any:
-    """A state with all of its tensors on the processor, as files hold them."""
-    if isinstance(state, Tensor):
-        return state.cpu()
-    if isinstance(state, Mapping):
-        return {key: on_host(value) for key, value in state.items()}
-    return state

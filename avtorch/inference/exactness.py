@@ -14,7 +14,7 @@ A mode that no chain has reached is searched for by ascents of the density that 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float, Int
 from avtorch.inference.compiled import Compiled, Unavailable, compiled
 from avtorch.inference.coordinates import Coordinates, score_of
-from avtorch.inference.density import Density, has_selection
+from avtorch.inference.density import Density, has_selection, selected
 from avtorch.inference.importance import RELIABLE, pareto_k
 from avtorch.inference.map import find_mode
 from avtorch.inference.planes import from_planes, lower_times, lower_transposed_times, to_planes
@@ -151,17 +151,16 @@ class Exactness:
             if len(index) == len(self.missed):
                 return other
             where = torch.ones_like(index, dtype=torch.bool)
-        parts, here, there = {}, index[where], where.nonzero().squeeze(-1)
-        for name in self.__dataclass_fields__:
-            parts[name] = getattr(self, name).index_copy(0, here, getattr(other, name)[there])
-        return replace(self, **parts)
+        here, there = index[where], where.nonzero().squeeze(-1)
+        pairs = {f.name: (getattr(self, f.name), getattr(other, f.name)[there]) for f in fields(self)}
+        return Exactness(**{name: mine.index_copy(0, here, theirs) for name, (mine, theirs) in pairs.items()})
 
     @classmethod
     def unknown(cls, z: Float[Tensor, "window parameter"]) -> Exactness:
         """NaN throughout, in the shape of ``z`` ``(window, parameter)``: nothing is known of any window."""
         each = torch.full_like(z, torch.nan, dtype=torch.float64)
-        a, b, c, d, e, f, g, h, i = (each.clone() for _ in range(9))
-        return cls(each[:, 0].clone(), a, b, c, d, e, f, g, h, i, each[:, 0].clone())
+        window = ("pareto_k", "missed")
+        return cls(**{f.name: (each[:, 0] if f.name in window else each).clone() for f in fields(cls)})
 
 
 def compare_with_exact(
@@ -198,18 +197,12 @@ def compare_with_exact(
         # more points do not help where the ratios' tail is clearly heavy
         index = chosen(~(found.clear() if count == closer else found.clear() | found.sure()))
         if len(index):
-            found = found.put(index, weighed(_picked(density, index), moments.select(index), count, eager=eager))
+            found = found.put(index, weighed(selected(density, index), moments.select(index), count, eager=eager))
     index = chosen(found.holds())
     if len(index):
         part = moments.select(index)
-        found.missed[index] = missed_mass(_picked(density, index), part.mean, part.lower, eager=eager)
+        found.missed[index] = missed_mass(selected(density, index), part.mean, part.lower, eager=eager)
     return found
-
-
-def _picked(density: Density, index: Tensor) -> Density:
-    if has_selection(density) and len(index) < density.windows:
-        return density.select(index)
-    return density
 
 
 class Moments(NamedTuple):
@@ -272,7 +265,7 @@ def weighed(density: Density, moments: Moments, points: int, *, eager: bool = Fa
     found = []
     size = max(1, (CARD_BLOCK if mean.is_cuda else BLOCK) // points) if has_selection(density) else len(mean)
     for part in torch.arange(len(mean), device=mean.device).split(size):
-        chosen = _picked(density, part)
+        chosen = selected(density, part)
         loops = Unavailable("not asked for") if eager else compiled(chosen)
         if isinstance(loops, Unavailable):
             found.append(_weighed(chosen, mean[part], lower[part], base, log_proposal))
@@ -368,7 +361,7 @@ def missed_mass(
     if not len(index) or not (has_selection(density) or len(mean) == 1):
         return missed
     best = height.masked_fill(~high, -torch.inf).argmax(0)[index]
-    chosen = _picked(density, index)
+    chosen = selected(density, index)
     other = find_mode(chosen, start=lower_times(lower[index], w[best, index]) + mean[index])
     with torch.no_grad():
         centre = chosen.log_prob(mean[index])

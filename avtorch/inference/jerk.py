@@ -156,19 +156,15 @@ class JerkDensity:
 
     def exponential_form(self) -> ExponentialForm | None:
         """Minus :meth:`log_prob` in the form that a compiled walk takes; ``None`` for a prior that is not of it."""
-        return self._form_with(_LOG_SCALED, torch.zeros(3, dtype=torch.float64))
-
-    def _form_with(self, exponents: Tensor, offsets: Tensor) -> ExponentialForm | None:
         if self._form is not None and self._form[0] is self.prior:
             return self._form[1]
         prior = terms_of(self.prior, self.windows)
         if prior is None:
             return None
         n = self.statistics.n
-        exponents, offsets = exponents.to(n.device), offsets.to(n.device)
         linear = torch.cat([prior.linear[:, :2], prior.linear[:, 2:] + n[:, None]], -1)
         terms = replace(prior, constant=prior.constant + 0.5 * _LOG_2PI * n, linear=linear)
-        form = ExponentialForm(terms, exponents, offsets, 2 * self._half_form)
+        form = ExponentialForm(terms, _LOG_SCALED.to(n.device), n.new_zeros(3), 2 * self._half_form)
         self._form = (self.prior, form)
         return form
 

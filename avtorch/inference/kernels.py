@@ -528,18 +528,3 @@ def summarise(first, last, kept, lower, groups, pieces, tail, rhat, furthest, me
             errors[window, i, 0] = beyond / (draws * chains)
             errors[window, i, 1] = np.sqrt((of_each - sum_each * sum_each / n) / (n - 1) / n / variance)
             errors[window, i, 2] = 0.5 * np.sqrt((of_square - sum_square * sum_square / n) / (n - 1) / n) / variance
-
-
-@njit(cache=True, **_OPTIONS)
-def noise(out, k0, k1):
-    """The noise of a walk, ``(step, 3, window, chain)``, the first step's being what ``averaged`` starts from."""
-    chains = out.shape[3]
-    each, words = np.zeros(3 * LANES), np.zeros(4 * LANES, dtype=np.uint64)
-    for step in range(out.shape[0]):
-        for window in range(out.shape[2]):
-            for chain in range(0, chains, LANES):
-                lanes = min(LANES, chains - chain)
-                normals(each, words, chain, step, window, k0, k1)
-                for i in range(3):
-                    for c in range(lanes):
-                        out[step, i, window, chain + c] = each[i * LANES + c]

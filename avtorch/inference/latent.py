@@ -6,7 +6,7 @@ Which windows of a stream are excited is a fixed rule, independent of the poster
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, fields
 
@@ -100,14 +100,15 @@ class LatentWindow:
 
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> LatentWindow:
         """The windows named by ``index``."""
-        accel = None if self.accel is None else self.accel[index]
-        speed = None if self.speed is None else self.speed[index]
-        return LatentWindow(self.time[index], self.u[index], accel, speed, self.mask[index])
+        return self._each(lambda rows: rows[index])
 
     def to(self, device: Device) -> LatentWindow:
         """The same rows on another device."""
-        accel, speed = (None if x is None else x.to(device) for x in (self.accel, self.speed))
-        return LatentWindow(self.time.to(device), self.u.to(device), accel, speed, self.mask.to(device))
+        return self._each(lambda rows: rows.to(device))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> LatentWindow:
+        accel, speed = (None if x is None else change(x) for x in (self.accel, self.speed))
+        return LatentWindow(change(self.time), change(self.u), accel, speed, change(self.mask))
 
     def runs(self) -> tuple[LatentWindow, Int[Tensor, " run"]]:
         """Stretches without a gap or an unused row, one a row, and the window ``(run,)`` each comes from.
@@ -254,17 +255,11 @@ class LatentDensity:
 
     ``names`` is ``latent_names``; the density is in ``z = log(parameter)``. Gaps and unused rows split a window into
     runs, whose likelihoods add.
-
-    ``temper`` in (0, 1] is a power on the likelihood, for logs whose windows still spread wider than their posteriors
-    (a gain that differs between throttle and brake, say); SDs grow about as ``temper^-1/2``. 1 is the law as written.
     """
 
     quick_values = True
 
-    def __init__(self, data: LatentWindow, prior: Prior | None = None, *, temper: float = 1.0) -> None:
-        if not 0 < temper <= 1:
-            raise InputError(f"temper: {temper} is not in (0, 1]")
-        self.temper = temper
+    def __init__(self, data: LatentWindow, prior: Prior | None = None) -> None:
         self.data = data
         self.names = latent_names(accel=data.accel is not None, speed=data.speed is not None)
         own = Joint(default_actuation_prior(), default_noise_prior(self.names[2:])) if prior is None else prior
@@ -278,10 +273,10 @@ class LatentDensity:
 
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> LatentDensity:
         """The windows named by ``index``."""
-        return LatentDensity(self.data.select(index), self.prior.select(index), temper=self.temper)
+        return LatentDensity(self.data.select(index), self.prior.select(index))
 
     def log_likelihood(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
-        """``z`` ``(..., window, parameter)``; returns ``(..., window)`` [nats], not tempered."""
+        """``z`` ``(..., window, parameter)``; returns ``(..., window)`` [nats]."""
         p = dict(zip(self.names, z[..., self._owner, :].exp().unbind(-1), strict=True))
         per_run = run_log_likelihood(p, self._runs, self._steps)
         if len(self._owner) == self.windows:
@@ -299,7 +294,7 @@ class LatentDensity:
         return near
 
     def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
-        return self.temper * self.log_likelihood(z) + self.prior.log_prob(z)
+        return self.log_likelihood(z) + self.prior.log_prob(z)
 
     @torch.no_grad()
     def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
@@ -395,7 +390,6 @@ def latent_excitation(
     *,
     noise: Mapping[str, float] | None = None,
     reference: tuple[float, float] = REFERENCE,
-    least_bits: float = LEAST_BITS,
 ) -> tuple[Bool[Tensor, " window"], Float[Tensor, " window"]]:
     """Which windows are excited, ``(window,)`` bool, and their expected information, ``(window,)`` [bit].
 
@@ -447,7 +441,7 @@ def latent_excitation(
     determinant = (1.0 + known_T**2 * tt) * (1.0 + known_K**2 * kk) - (known_T * known_K * tk) ** 2
     bits = 0.5 * determinant.clamp(min=1.0).log() / math.log(2.0)
     bits = bits.to(place)
-    return bits >= least_bits, bits
+    return bits >= LEAST_BITS, bits
 
 
 def _sensitivities(runs: LatentWindow, T: float, K: float) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:

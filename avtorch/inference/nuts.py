@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from typing import Protocol, cast
 
 import torch
 from torch import Tensor
@@ -137,11 +137,6 @@ class PyroModel:
         """``z`` ``(parameter,)`` as Pyro's unconstrained sites."""
         return {site.name: site.unconstrained(z) for site in self.sites}
 
-    def walked(self, found: dict[str, Tensor]) -> Float[Tensor, "draw parameter"]:
-        """The result of Pyro's MCMC as ``z`` ``(draw, parameter)``."""
-        parts = [found[s.name] if s.log_space else found[s.name].log() for s in self.sites]
-        return torch.cat([part.reshape(len(part), -1) for part in parts], -1)
-
     def log_prob(self, z: Float[Tensor, " parameter"]) -> Float[Tensor, ""]:
         """Pyro's own log density of ``z`` ``(parameter,)``, Jacobian included: minus the potential of NUTS."""
         _, potential, _, _ = initialize_model(self, initial_params=self.unconstrained(z))
@@ -152,8 +147,6 @@ def nuts(
     density: _WithPrior,
     *,
     window: int = 0,
-    samples: tuple[Float[Tensor, " time"], Float[Tensor, " time"], Float[Tensor, " time"]] | None = None,
-    statements: bool = False,
     chains: int = 1,
     draws: int = 1000,
     warmup: int = 500,
@@ -166,33 +159,28 @@ def nuts(
     Chains start from the Laplace approximation at the mode and run one after another. PyTorch's global random state is
     unchanged.
 
-    `density`, `window`, `samples`: see :class:`PyroModel`. `statements`: let Pyro trace the model's statements at every
-    step; otherwise its sampler is given the same log density as a function, which takes a tenth of the time. `warmup`:
-    steps of adaptation, dropped.
+    Pyro's sampler is given the log density as a function, which takes a tenth of the time of tracing the statements of
+    :class:`PyroModel` at every step. `window`: which of the density's. `warmup`: steps of adaptation, dropped.
 
     Returns:
         Draws ``(chain, draw, 1, parameter)``; ``converged`` is false where R-hat exceeds ``rhat_max`` or more than 1 %
         of the draws diverged.
     """
-    model = PyroModel(density, window=window, samples=samples)
     alone = density.select(torch.tensor([window], device=getattr(density.prior, "device", None)))
-    mode = find_mode(alone)
-    how: dict[str, Any] = {"model": model} if statements or samples is not None else {"potential_fn": _potential(alone)}
+    mode, potential = find_mode(alone), _potential(alone)
     walked, diverged = [], 0
     with torch.random.fork_rng(devices=[mode.z.device] if mode.z.device.type == "cuda" else []):
         torch.manual_seed(seed)
         for _ in range(chains):
-            z = mode.z[0] + mode.scale[0] @ torch.randn_like(mode.z[0])
-            start = model.unconstrained(z) if "model" in how else {"z": z}
-            kernel = NUTS(full_mass=True, target_accept_prob=target_accept, **how)
+            start = {"z": mode.z[0] + mode.scale[0] @ torch.randn_like(mode.z[0])}
+            kernel = NUTS(full_mass=True, target_accept_prob=target_accept, potential_fn=potential)
             run = MCMC(kernel, draws, warmup, initial_params=start, disable_progbar=True)
             run.run()
-            found = run.get_samples()
-            walked.append(model.walked(found) if "model" in how else found["z"])
+            walked.append(run.get_samples()["z"])
             diverged += sum(len(v) for v in run.diagnostics()["divergences"].values())
     z = torch.stack(walked).unsqueeze(2)
     converged = (nested_rhat(z).amax(-1) <= rhat_max) & (diverged <= 0.01 * chains * draws)
-    return Posterior(model.names, z.exp(), converged)
+    return Posterior(density.names, z.exp(), converged)
 
 
 class _Scored(torch.autograd.Function):

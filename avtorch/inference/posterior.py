@@ -11,7 +11,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
-from avtorch.inference.arviz_export import UNITS, shown_unit
+from avtorch.inference.arviz_export import UNITS, inference_data, parameter_table
 from avtorch.inference.exactness import Exactness
 
 if TYPE_CHECKING:
@@ -58,18 +58,9 @@ class Posterior(Displayed):
 
     def summary(self) -> Frame:
         """A row a window and parameter: mean, sd, the 5 and 95 % quantiles, nested R-hat, effective draws."""
-        windows = self.draws.shape[2]
         stats = {"mean": self.mean, "sd": self.sd, "q05": self.quantile(0.05), "q95": self.quantile(0.95)}
         stats |= {"rhat": self.rhat, "ess_bulk": self.ess_bulk, "ess_tail": self.ess_tail}
-        return Frame(
-            {
-                "window": [w for w in range(windows) for _ in self.names],
-                "parameter": list(self.names) * windows,
-                "unit": [shown_unit(name) for name in self.names] * windows,
-                **{key: values.flatten().tolist() for key, values in stats.items()},
-                "converged": self.converged.repeat_interleave(len(self.names)).tolist(),
-            }
-        )
+        return parameter_table("window", self.names, stats, {"converged": self.converged})
 
     def to_dataframe(self) -> pandas.DataFrame:
         """The draws, a row a chain, draw and window, a column a parameter. Needs ``pip install 'avtorch[pandas]'``."""
@@ -87,8 +78,6 @@ class Posterior(Displayed):
 
         Raises `InputError` for a window that the posterior does not have, and where ArviZ is not installed.
         """
-        from avtorch.inference.arviz_export import inference_data
-
         windows = self.draws.shape[2]
         if window is not None and not 0 <= window < windows:
             raise InputError(f"window: {window} is not in 0 to {windows - 1}")

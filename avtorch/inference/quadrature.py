@@ -15,7 +15,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
-from avtorch.inference.arviz_export import shown_unit
+from avtorch.inference.arviz_export import parameter_table
 from avtorch.inference.density import Density
 from avtorch.inference.map import Mode, find_mode
 
@@ -76,16 +76,8 @@ class Quadrature(Displayed):
 
     def summary(self) -> Frame:
         """A row a window and parameter: mean, sd and the 5 and 95 % quantiles."""
-        windows = len(self.converged)
         stats = {"mean": self.mean, "sd": self.sd, "q05": self.quantile(0.05), "q95": self.quantile(0.95)}
-        return Frame(
-            {
-                "window": [w for w in range(windows) for _ in self.names],
-                "parameter": list(self.names) * windows,
-                "unit": [shown_unit(name) for name in self.names] * windows,
-                **{key: values.flatten().tolist() for key, values in stats.items()},
-            }
-        )
+        return parameter_table("window", self.names, stats)
 
     def cdf(self, values: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
         """Posterior probability of a parameter below ``values`` ``(..., window, parameter)``, in their own units.
@@ -113,12 +105,6 @@ class Quadrature(Displayed):
             below = self.cdf(middle.exp()) < q
             low, high = torch.where(below, middle, low), torch.where(below, high, middle)
         return (0.5 * (low + high)).exp()
-
-    def stat(self, name: str, window: int = 0) -> dict[str, float]:
-        """``{"mean", "sd", "q05", "q95"}`` of one parameter of one window."""
-        i = self.names.index(name)
-        table = {"mean": self.mean, "sd": self.sd, "q05": self.quantile(0.05), "q95": self.quantile(0.95)}
-        return {key: float(value[window, i]) for key, value in table.items()}
 
 
 def integrate(density: Density, *, mode: Mode | None = None, nodes: int = 49, tolerance: float = 0.03) -> Quadrature:

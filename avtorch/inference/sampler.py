@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 from torch.optim import Optimizer
@@ -11,8 +9,8 @@ from torch.optim import Optimizer
 from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
 from avtorch.inference.compiled import chosen
-from avtorch.inference.coordinates import Coordinates, stiffness
-from avtorch.inference.density import Density, SubsampledDensity, constrained, has_score, has_selection
+from avtorch.inference.coordinates import Coordinates, score_of, stiffness
+from avtorch.inference.density import Density, SubsampledDensity, constrained, has_selection, selected
 from avtorch.inference.device import check_generator
 from avtorch.inference.exactness import TAIL, Exactness, Moments, compare_with_exact, pieces_of, root_of
 from avtorch.inference.map import Mode, find_mode
@@ -80,7 +78,7 @@ def sample(
     open_ = torch.arange(density.windows, device=mode.z.device)
     for attempt in range(settings.attempts):
         for index in _batches(density, open_, slowdown, settings.chains):
-            part, where = _select(density, index), mode.select(index)
+            part, where = selected(density, index), mode.select(index)
             times = float(_longer(slowdown[index]).amax())
             coordinates, w = _walk(part, where, settings.slower(times), slowdown[index], generator)
             fresh = torch.isin(index, open_)
@@ -126,7 +124,7 @@ def _adapted(
         return mode, slowdown
     fitted, fitted_slowdown = mode, slowdown.clone()
     for index in _batches(density, uneven, slowdown, settings.chains):
-        part, where = _select(density, index), mode.select(index)
+        part, where = selected(density, index), mode.select(index)
         # a rough covariance will do
         coordinates, w = _walk(part, where, settings.slower(PILOT), slowdown[index], generator)
         better = where.refitted(coordinates.z(w).flatten(0, 1))
@@ -181,12 +179,6 @@ def _batches(density: Density, index: Tensor, slowdown: Tensor, chains: int) -> 
             batches += few.sort().values.split(size)
             few = index[:0]
     return batches
-
-
-def _select(density: Density, index: Tensor) -> Density:
-    if len(index) == density.windows or not has_selection(density):
-        return density
-    return density.select(index)
 
 
 def _summary(
@@ -256,14 +248,15 @@ def _walk(
     else:
         optimizer = settings.optimizer([w], settings.step, generator)
     scheduler = None if settings.schedule is None else settings.schedule(optimizer)
-    gradient = _gradient(density, coordinates, w, settings.batch, generator)
+    state = w.detach()
     graph = any(group.get("preconditioner") for group in optimizer.param_groups)
     kept = empty_planes(settings.draws, *shape, dtype=w.dtype, device=w.device)
 
     def closure() -> Tensor | None:
         if graph:  # differentiates the potential itself, and again
             return -_log_prob(density, coordinates.z(w), settings.batch, generator).sum()
-        w.grad = gradient()
+        score = _score(density, coordinates.z(state), settings.batch, generator)
+        w.grad = coordinates.pull_back(score).neg_()
         if k < settings.burn_in:
             # far out the slope may be arbitrary, and a step along it would move the chain even further
             w.grad.nan_to_num_(nan=0.0).clamp_(-TAMED, TAMED)
@@ -288,19 +281,11 @@ def _log_prob(density: Density, z: Tensor, batch: int | None, generator: torch.G
     return density.log_prob_minibatch(z, torch.randint(density.points, (batch,), generator=generator, device=z.device))
 
 
-def _gradient(
-    density: Density, coordinates: Coordinates, w: Tensor, batch: int | None, generator: torch.Generator | None
-) -> Callable[[], Tensor]:
-    """``dU/dw`` at the present ``w``; for a density with its own score no graph is built."""
-    state = w.detach()
-    if batch is None and has_score(density):
-        scored = density
-        return lambda: coordinates.pull_back(scored.score(coordinates.z(state))).neg_()
-
-    def differentiated() -> Tensor:
-        with torch.enable_grad():
-            z = coordinates.z(state).requires_grad_()
-            (score,) = torch.autograd.grad(_log_prob(density, z, batch, generator).sum(), z)
-        return coordinates.pull_back(score).neg_()
-
-    return differentiated
+def _score(density: Density, z: Tensor, batch: int | None, generator: torch.Generator | None) -> Tensor:
+    """Gradient of the log density, or of its estimate from a minibatch."""
+    if batch is None:
+        return score_of(density, z)
+    z = z.requires_grad_()
+    with torch.enable_grad():
+        (score,) = torch.autograd.grad(_log_prob(density, z, batch, generator).sum(), z)
+    return score

@@ -12,7 +12,7 @@ from avtorch.validation.agreement import Agreement, AgreementVerdict, agreement,
 from avtorch.validation.reference import NutsSettings
 from avtorch.validation.stein import Stein, stein_discrepancy
 from avtorch.validation.validate import Validation, validate
-from avtorch.validation.windows import Windows, synthetic_windows, windows_from_prior, windows_of_log
+from avtorch.validation.windows import Windows, synthetic_windows, windows_of_log
 
 __all__ = [
     "Agreement",
@@ -26,6 +26,5 @@ __all__ = [
     "stein_discrepancy",
     "synthetic_windows",
     "validate",
-    "windows_from_prior",
     "windows_of_log",
 ]

@@ -13,16 +13,15 @@ Chains that stand still in different places are still detected.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from types import ModuleType
+from dataclasses import dataclass
 
 import torch
 from scipy.stats import binomtest, chi2
 from torch import Tensor
 
 from avtorch.errors import InputError
+from avtorch.inference.arviz_export import arviz
 from avtorch.inference.posterior import Posterior
 from avtorch.inference.quadrature import Quadrature
 
@@ -47,18 +46,6 @@ class Diagnostics:
     ess_mean: Tensor
     ess_bulk: Tensor
     ess_tail: Tensor
-
-
-def arviz() -> ModuleType:
-    """ArviZ, or an `InputError` with the command that installs it."""
-    with warnings.catch_warnings():
-        # ArviZ 0.23 announces its successor on import
-        warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major refactor", FutureWarning)
-        try:
-            import arviz
-        except ImportError:
-            raise InputError("arviz: not installed; validation needs pip install 'avtorch[validate]'") from None
-    return arviz
 
 
 def superchains(draws: Tensor, count: int = SUPERCHAINS) -> Tensor:
@@ -152,10 +139,6 @@ class Agreement:
     rhat: Tensor
     ess_bulk: Tensor
     ess_tail: Tensor
-
-    def select(self, index: Tensor) -> Agreement:
-        """The windows named by ``index``."""
-        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "names"})
 
     def within(self, *, slack: float = 0.0) -> Tensor:
         """Windows that meet the tolerance in every parameter, ``(window,)`` bool.

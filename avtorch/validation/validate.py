@@ -29,8 +29,6 @@ from avtorch.validation.reference import (
     NUTS_WINDOWS,
     NutsSettings,
     exact_draws,
-    join,
-    join_draws,
     reference,
     select,
     walk_nuts,
@@ -43,8 +41,6 @@ if TYPE_CHECKING:
 
 Progress = Callable[[float, float], None]
 
-#: Windows at once, so that progress can be shown and the memory of the quadrature stays bounded.
-BLOCK = 50
 #: Weight of a window of NUTS in the progress; one of SGLD and quadrature has weight one.
 NUTS_SHARE = 20
 
@@ -147,14 +143,12 @@ class Validation(Displayed):
         return {"sgld": inside.double().mean((0, 1))}
 
     def quadrature_draws(self, index: Tensor | None = None, *, chains: int = 4, draws: int = 500) -> Posterior | None:
-        """Independent draws of the joint posterior (see `exact_draws`), of all windows or those named by ``index``."""
+        """Independent draws of the joint posterior (see `exact_draws`), of all windows or those named by ``index``;
+        None where quadrature was not run."""
         if self.quadrature is None:
             return None
-        density, exact = self.windows.density, self.quadrature
-        if index is not None:
-            density, exact = self.windows.select(index).density, select(exact, index)
-        generator = torch.Generator().manual_seed(self.seed)
-        return exact_draws(density, exact, chains=chains, draws=draws, generator=generator)
+        density = self.windows.density if index is None else self.windows.select(index).density
+        return exact_draws(density, chains=chains, draws=draws, generator=torch.Generator().manual_seed(self.seed))
 
     def to_arviz(self) -> dict[str, InferenceData]:
         """The draws of "sgld", "nuts" and, where it was run, "quadrature" (as independent draws) for ArviZ."""
@@ -223,20 +217,22 @@ def validate(
     chosen = torch.linspace(0, len(source) - 1, min(nuts_windows, len(source))).round().long()
     count = _ProgressCount(called(progress), len(source) + NUTS_SHARE * len(chosen))
     generator = torch.Generator().manual_seed(seed)
-    blocks = [_block(source.select(i), settings, generator, count) for i in torch.arange(len(source)).split(BLOCK)]
-    sgld = join_draws([b.sgld for b in blocks])
-    exact = [b.quadrature for b in blocks if b.quadrature is not None]
-    quadrature = join(exact) if exact else None
-    stein = Stein(
-        *(torch.cat([getattr(b.stein, name) for b in blocks]) for name in ("value", "expected", "p_value")),
-        points=blocks[0].stein.points,
-    )
+    begun = clock.perf_counter()
+    sgld = sample(source.density, settings, generator=generator)  # search for the mode included
+    sgld_s = clock.perf_counter() - begun
+    count.add(0.3 * len(source))
+    begun = clock.perf_counter()
+    quadrature = reference(source, done=lambda: count.add(0.5)) if len(source.names) <= 3 else None
+    quadrature_s = 0.0 if quadrature is None else clock.perf_counter() - begun
+    mode = find_mode(source.density)
+    stein = stein_discrepancy(source.density, sgld.draws.log(), mode=mode, generator=generator)
+    count.add((0.2 if quadrature is not None else 0.7) * len(source))
     begun = clock.perf_counter()
     walked = walk_nuts(source, chosen, nuts, seed=seed, done=lambda: count.add(NUTS_SHARE))
     seconds = {
-        "sgld": sum(b.sgld_seconds for b in blocks) / len(source),
+        "sgld": sgld_s / len(source),
         "nuts": (clock.perf_counter() - begun) / len(chosen),
-        "quadrature": sum(b.quadrature_seconds for b in blocks) / len(source),
+        "quadrature": quadrature_s / len(source),
     }
     sgld_nuts = between(_of_windows(sgld, chosen), walked)
     if quadrature is None:
@@ -279,32 +275,6 @@ class _ProgressCount:
         self.done += amount
         if self.progress is not None:
             self.progress(self.done, self.total)
-
-
-@dataclass(frozen=True)
-class _Block:
-    """The results of a few windows, and the seconds they took."""
-
-    sgld: Posterior
-    quadrature: Quadrature | None
-    stein: Stein
-    sgld_seconds: float
-    quadrature_seconds: float
-
-
-def _block(windows: Windows, settings: SamplerSettings, generator: torch.Generator, count: _ProgressCount) -> _Block:
-    density = windows.density
-    begun = clock.perf_counter()
-    sgld = sample(density, settings, generator=generator)  # search for the mode included
-    sgld_seconds = clock.perf_counter() - begun
-    count.add(0.3 * len(windows))
-    begun = clock.perf_counter()
-    quadrature = reference(windows) if len(windows.names) <= 3 else None
-    seconds = clock.perf_counter() - begun if quadrature is not None else 0.0
-    count.add(0.5 * len(windows))
-    stein = stein_discrepancy(density, sgld.draws.log(), mode=find_mode(density), generator=generator)
-    count.add(0.2 * len(windows))
-    return _Block(sgld, quadrature, stein, sgld_seconds, seconds)
 
 
 def _of_windows(posterior: Posterior, index: Tensor) -> Posterior:

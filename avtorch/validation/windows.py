@@ -18,36 +18,12 @@ from avtorch.inference.density import Density, SelectableDensity
 from avtorch.inference.form import ExcitationRule, Form, JerkForm
 from avtorch.inference.jerk import JerkDensity, JerkStatistics
 from avtorch.inference.latent import LatentForm
-from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
+from avtorch.inference.priors import Joint, default_actuation_prior
 from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.log import Log, no_command
 from avtorch.io.us06 import US06_SPEED_MPS
 from avtorch.vehicle.glvd import glvd_jerk, glvd_rollout
-
-Amplitude = float | tuple[float, float]
-"""Of a command's first sine [m/s^2]: a number, or a range from which each window's is drawn evenly in the logarithm."""
-
-
-def sine_commands(
-    windows: int, rows: int, amplitude: Amplitude, *, dt: float = 0.01, generator: torch.Generator | None = None
-) -> Tensor:
-    """Two sines (2 and 5 rad/s, the second half as large) of random phases: demanded acceleration [m/s^2].
-
-    `amplitude`: see :data:`Amplitude`. `dt`: sampling step [s].
-
-    Returns:
-        Shape ``(window, time)``.
-
-    Raises `InputError` for an amplitude that is not positive, or a range that runs down.
-    """
-    low, high = amplitude if isinstance(amplitude, tuple) else (amplitude, amplitude)
-    if not 0 < low <= high:
-        raise InputError(f"amplitude: found {amplitude}, need a positive number or a rising range of them")
-    phase = 2 * torch.pi * torch.rand(2, windows, 1, generator=generator, dtype=torch.float64)
-    time = dt * torch.arange(rows, dtype=torch.float64)
-    size = low * (high / low) ** torch.rand(windows, 1, generator=generator, dtype=torch.float64)
-    return size * (torch.sin(2 * time + phase[0]) + 0.5 * torch.sin(5 * time + phase[1]))
 
 
 def simulate_windows(
@@ -73,20 +49,6 @@ def simulate_windows(
     moved = glvd_rollout(u[:, 0], u + (lag / gain)[:, None] * noise, lag, gain, lag.clamp_max(dt), method="euler")
     a = torch.cat([u[:, :1], moved[:, :-1]], -1)
     return a, glvd_jerk(a, u, lag[:, None], gain[:, None]) + noise
-
-
-def statistics(
-    z: Tensor,
-    *,
-    rows: int = 200,
-    amplitude: Amplitude = 1.0,
-    dt: float = 0.01,
-    generator: torch.Generator | None = None,
-) -> JerkStatistics:
-    """The six sums of one fresh window of every vehicle ``z``; arguments of `sine_commands`, `simulate_windows`."""
-    u = sine_commands(len(z), rows, amplitude, dt=dt, generator=generator)
-    a, jerk = simulate_windows(z, u, dt=dt, generator=generator)
-    return JerkStatistics.from_samples(a, u, jerk)
 
 
 #: Ranges of the synthetic windows, each log-uniform but the gain, which is uniform: lag [s], gain [-], jerk noise
@@ -176,22 +138,27 @@ def synthetic_windows(count: int, *, seed: int = 0) -> Windows:
         >>> bool(((estimate / truth - 1).abs() < 0.5).all())
         True
     """
-    generator = _generator(count, seed)
+    if count < 1:
+        raise InputError(f"windows: found {count}, needs 1 or more")
+    generator = torch.Generator().manual_seed(seed)
     T, sigma = _log_uniform(LAG, count, generator), _log_uniform(NOISE, count, generator)
     K = GAIN[0] + (GAIN[1] - GAIN[0]) * torch.rand(count, generator=generator, dtype=torch.float64)
-    prior = Joint(default_actuation_prior(), default_jerk_noise_prior())
-    return _windows_of(torch.stack([T, K, sigma], -1), prior, generator)
-
-
-def windows_from_prior(count: int, *, seed: int = 0, prior: Prior | None = None) -> Windows:
-    """The same drives with vehicles drawn from the prior: the truths for which intervals must have their stated
-    coverage.
-
-    Raises `InputError` for ``count`` below 1.
-    """
-    generator = _generator(count, seed)
-    prior = Joint(default_actuation_prior(), default_jerk_noise_prior()) if prior is None else prior
-    return _windows_of(prior.sample(1, count, generator=generator)[0].exp(), prior, generator)
+    truth = torch.stack([T, K, sigma], -1)
+    u = command(count, max(POINTS), generator=generator)
+    points = torch.tensor(POINTS).repeat(-(-count // len(POINTS)))[:count]
+    inside = torch.arange(u.shape[-1]) < points[:, None]
+    a, jerk = simulate_windows(truth.log(), u, dt=DT, generator=generator)
+    statistics = JerkStatistics.from_samples(a, u, jerk, inside)
+    return Windows(
+        name="synthetic",
+        form="jerk",
+        density=JerkDensity(statistics),
+        n=statistics.n,
+        excited=ExcitationRule()(statistics, 0.0),  # every row is usable
+        truth=truth,
+        start_s=torch.zeros(count, dtype=torch.float64),
+        end_s=DT * points.double(),
+    )
 
 
 def windows_of_log(log: Log, *, window: float = 2.0, count: int | None = None) -> Windows:
@@ -237,26 +204,6 @@ def windows_of_log(log: Log, *, window: float = 2.0, count: int | None = None) -
     )
 
 
-def _windows_of(truth: Tensor, prior: Prior, generator: torch.Generator) -> Windows:
-    """Windows of vehicles ``(T_L, K_L, sigma)``, ``truth`` ``(window, 3)``."""
-    count = len(truth)
-    u = command(count, max(POINTS), generator=generator)
-    points = torch.tensor(POINTS).repeat(-(-count // len(POINTS)))[:count]
-    inside = torch.arange(u.shape[-1]) < points[:, None]
-    a, jerk = simulate_windows(truth.log(), u, dt=DT, generator=generator)
-    statistics = JerkStatistics.from_samples(a, u, jerk, inside)
-    return Windows(
-        name="synthetic",
-        form="jerk",
-        density=JerkDensity(statistics, prior),
-        n=statistics.n,
-        excited=ExcitationRule()(statistics, 0.0),  # every row is usable
-        truth=truth,
-        start_s=torch.zeros(count, dtype=torch.float64),
-        end_s=DT * points.double(),
-    )
-
-
 def command(windows: int, rows: int, *, dt: float = DT, generator: torch.Generator | None = None) -> Tensor:
     """Demanded accelerations [m/s^2], ``(window, time)``: sums of three sines and pieces of US06 in turn.
 
@@ -290,12 +237,6 @@ def _us06(windows: int, time: Tensor, generator: torch.Generator | None) -> Tens
 def _log_uniform(bounds: tuple[float, float], count: int, generator: torch.Generator | None) -> Tensor:
     low, high = map(math.log, bounds)
     return (low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float64)).exp()
-
-
-def _generator(count: int, seed: int) -> torch.Generator:
-    if count < 1:
-        raise InputError(f"windows: found {count}, needs 1 or more")
-    return torch.Generator().manual_seed(seed)
 
 
 def _spans(log: Log, window: float) -> list[tuple[float, slice]]:

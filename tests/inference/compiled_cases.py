@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from avtorch.inference import JerkDensity
@@ -71,3 +72,14 @@ def densities(make_windows):
 
 
 KINDS = ["first", "carried", "of the paper", "some started"]
+
+
+def walk_noise(kernels, out, k0, k1):
+    """The noise of a compiled walk into ``out`` ``(step, 3, window, chain)``, the first step's being what ``averaged``
+    starts from."""
+    lanes, chains = kernels.LANES, out.shape[3]
+    each, words = np.zeros(3 * lanes), np.zeros(4 * lanes, dtype=np.uint64)
+    for step, window in np.ndindex(out.shape[0], out.shape[2]):
+        for chain in range(0, chains, lanes):
+            kernels.normals(each, words, chain, step, window, k0, k1)
+            out[step, :, window, chain : chain + lanes] = each.reshape(3, lanes)[:, : chains - chain]

@@ -22,7 +22,7 @@ from avtorch.inference.exactness import Moments, missed_mass, weighed
 from avtorch.inference.planes import empty_planes
 from avtorch.inference.sampler import _summary, walk
 from tests.bars import BAR
-from tests.inference.compiled_cases import KINDS, Gaussian, densities, generator
+from tests.inference.compiled_cases import KINDS, Gaussian, densities, generator, walk_noise
 
 kernels = pytest.importorskip("avtorch.inference.kernels", exc_type=ImportError)
 
@@ -47,7 +47,7 @@ def fed(settings, seed, start, windows):
         torch.randn(settings.chains, windows, 3, dtype=F64, generator=g)
     steps = settings.burn_in + settings.draws * settings.thinning
     noise = np.empty((steps + 1, 3, windows, settings.chains))
-    kernels.noise(noise, *words(g))
+    walk_noise(kernels, noise, *words(g))
     each = torch.from_numpy(noise).permute(0, 3, 2, 1)
     each = list(each) if settings.noise == "averaged" else list(each[1:])
     # the averaged noise asks for the fresh number first, and for what it starts from second

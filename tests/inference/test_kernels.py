@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 from tests.bars import BAR
+from tests.inference.compiled_cases import walk_noise
 
 kernels = pytest.importorskip("avtorch.inference.kernels", exc_type=ImportError)
 
@@ -44,7 +45,7 @@ def test_the_exponential_is_exact_to_two_units():
 def test_the_noise_is_normal_and_independent(rotating_seed, draws_factor):
     """Moments, distribution, and correlations between parameters, windows, chains and steps, also of squares."""
     out = np.empty((40, 3, 5, 320 * draws_factor))
-    kernels.noise(out, np.uint64(rotating_seed % 2**32), np.uint64(1))
+    walk_noise(kernels, out, np.uint64(rotating_seed % 2**32), np.uint64(1))
     n = out.size
     for power, (mean, variance) in {1: (0, 1), 2: (1, 2), 3: (0, 15), 4: (3, 96)}.items():
         assert abs((out**power).mean() - mean) < BAR * (variance / n) ** 0.5

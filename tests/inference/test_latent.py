@@ -255,16 +255,6 @@ def test_select_and_stack_are_inverse_up_to_padding() -> None:
     assert torch.equal(again.mask, data.mask)
 
 
-def test_temper_is_a_power_on_the_likelihood() -> None:
-    data = simulate(60, torch.Generator().manual_seed(0), windows=1)
-    whole, half = LatentDensity(data), LatentDensity(data, temper=0.5)
-    z = whole.initial()
-    gone = whole.log_prob(z) - half.log_prob(z)
-    torch.testing.assert_close(gone, 0.5 * whole.log_likelihood(z))
-    with pytest.raises(InputError, match="temper"):
-        LatentDensity(data, temper=0.0)
-
-
 def test_names_follow_the_signals() -> None:
     assert latent_names(accel=False, speed=True)[2:5] == ("process_noise", "road_noise", "speed_noise")
     assert "road_noise" not in latent_names(accel=True, speed=False)

@@ -185,14 +185,6 @@ def test_cdf_is_uniform_over_draws_of_the_law(rotating_seed: int, draws_factor: 
         assert stats.kstest(u[:, 0, i].numpy(), "uniform").pvalue > LEVEL
 
 
-def test_stat_is_the_table(make_windows) -> None:
-    found = integrate(JerkDensity(make_windows(1, [1.0, 2.0]).statistics), nodes=25)
-    stat = found.stat("K_L", 1)
-    assert stat["mean"] == float(found.mean[1, 1])
-    assert stat["q05"] < stat["mean"] < stat["q95"]
-    assert stat["q95"] - stat["q05"] == pytest.approx(2 * 1.645 * stat["sd"], rel=0.05)
-
-
 def test_bad_input_names_itself() -> None:
     with pytest.raises(InputError, match="density: 4 parameters"):
         integrate(Gammas(torch.ones(1, 4, dtype=F64)))

@@ -60,7 +60,7 @@ def test_the_prior_of_the_second_window(mode, make_windows):
         assert isinstance(prior.actuation, QuadrantNormal)
         assert prior.actuation.mean.equal(loop.belief.mean[:, :2])
         assert prior.actuation.variance == 0.09
-        assert prior.noise is loop.noise_prior
+        assert prior.noise is loop.first_prior.noise
     else:
         assert isinstance(prior, LogSpaceNormal)
         # the kept draws are a thinned quarter of the 3840, so their moments are near, not equal

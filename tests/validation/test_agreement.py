@@ -15,7 +15,7 @@ from avtorch.inference.priors import LogSpaceNormal
 
 pytest.importorskip("arviz")
 
-from avtorch.validation.agreement import Agreement, agreement, between, sampling_diagnostics, superchains
+from avtorch.validation.agreement import agreement, between, sampling_diagnostics, superchains
 from tests.bars import BAR
 
 LOG_SD = 0.05
@@ -192,15 +192,6 @@ def test_w1_of_two_sets_is_exact() -> None:
     assert float(between(draws, twice).w1.max()) < 1e-9
 
 
-def test_windows_can_be_selected() -> None:
-    law = LogNormals(3)
-    found = agreement(law.posterior(autoregressive((4, 50, 3, 2), 0.0, 1)), law.exact())
-    part = found.select(torch.tensor([2, 0]))
-    assert isinstance(part, Agreement)
-    assert torch.equal(part.w1, found.w1[[2, 0]])
-    assert part.names == found.names
-
-
 def test_what_cannot_be_compared() -> None:
     law = LogNormals(2)
     draws = law.posterior(autoregressive((4, 50, 2, 2), 0.0, 1))
@@ -214,5 +205,5 @@ def test_what_cannot_be_compared() -> None:
 
 def test_arviz_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "arviz", None)
-    with pytest.raises(InputError, match=r"pip install 'avtorch\[validate\]'"):
+    with pytest.raises(InputError, match=r"needs pip install 'avtorch\[arviz\]' or 'avtorch\[validate\]'"):
         sampling_diagnostics(even(100))

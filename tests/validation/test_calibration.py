@@ -14,10 +14,11 @@ from torch import Tensor
 from avtorch.errors import InputError
 from avtorch.inference import ExcitationRule, JerkDensity
 from avtorch.inference.priors import LogNormalPrior
-from avtorch.validation.windows import simulate_windows, sine_commands, statistics
+from avtorch.validation.windows import simulate_windows
 from benchmarks.calibration import sbc, sbc_loop
 from benchmarks.peers.conjugate import sample_conjugate
 from benchmarks.rank_calibration import RankCalibration, sbc_quadrature
+from benchmarks.sine_windows import sine_commands, statistics
 from tests.bars import BAR, LEVEL
 
 F64 = torch.float64

@@ -9,7 +9,7 @@ import torch
 
 from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, JerkStatistics, integrate
-from avtorch.validation.windows import simulate_windows, sine_commands
+from avtorch.validation.windows import simulate_windows
 from benchmarks.pooled import (
     FreeNoise,
     PooledComparison,
@@ -21,6 +21,7 @@ from benchmarks.pooled import (
     truth_given_all,
     windows_of,
 )
+from benchmarks.sine_windows import sine_commands
 
 F64 = torch.float64
 

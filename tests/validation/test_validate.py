@@ -42,7 +42,7 @@ def exact(windows: Windows) -> Quadrature:
 
 def drawn(windows: Windows, exact: Quadrature, seed: int, count: int = 8000) -> Posterior:
     g = torch.Generator().manual_seed(seed)
-    return exact_draws(windows.density, exact, chains=8, draws=count // 8, generator=g)
+    return exact_draws(windows.density, chains=8, draws=count // 8, generator=g)
 
 
 def inflated(posterior: Posterior, factor: float) -> Posterior:

@@ -17,12 +17,9 @@ from avtorch.validation.windows import (
     Windows,
     command,
     synthetic_windows,
-    windows_from_prior,
     windows_of_log,
 )
 from avtorch.vehicle import GLVDPlant, Leader, simulate
-from benchmarks.peers.conjugate import sample_conjugate
-from tests.bars import BAR
 
 
 @pytest.fixture(scope="module")
@@ -68,19 +65,6 @@ def test_a_seed_repeats_and_another_does_not() -> None:
     first, again, other = (density(synthetic_windows(6, seed=s)).statistics for s in (1, 1, 2))
     assert torch.equal(first.jj, again.jj)
     assert not bool((first.jj == other.jj).any())
-
-
-@pytest.mark.statistical
-def test_posterior_holds_the_truth_that_the_prior_drew(rotating_seed: int, draws_factor: int) -> None:
-    found = windows_from_prior(300 * draws_factor, seed=rotating_seed)
-    generator = torch.Generator().manual_seed(rotating_seed)
-    exact = sample_conjugate(density(found), draws=1000, generator=generator)
-    assert found.truth is not None
-    below = (exact.posterior.flat < found.truth).double().mean(0)[exact.posterior.converged]
-    assert len(below) > 200
-    # uniform: mean and variance
-    assert float(((below.mean(0) - 0.5).abs() * math.sqrt(12 * len(below))).max()) < BAR
-    assert float(((12 * below.var(0) - 1).abs() * math.sqrt(len(below) / 0.8)).max()) < BAR
 
 
 def test_windows_can_be_selected() -> None:

@@ -1,11 +1,11 @@
 """Estimators behind one interface: SGLD's loop, importance sampling and the modes alone of the same posteriors, least
 squares and joint Kalman filters."""
 
+from avtorch.inference.estimator import Estimator
 from avtorch.inference.estimators.choose import ESTIMATORS, make_estimator
 from avtorch.inference.estimators.kalman import JointEKF, JointUKF
 from avtorch.inference.estimators.other_posteriors import ImportanceSampling, MaximumAPosteriori
 from avtorch.inference.estimators.rls import RecursiveLeastSquares
-from avtorch.inference.estimators.windowed import Estimator
 
 __all__ = [
     "ESTIMATORS",

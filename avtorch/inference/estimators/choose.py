@@ -6,14 +6,15 @@ import inspect
 from typing import Any
 
 from avtorch.errors import InputError
+from avtorch.inference.estimator import Estimator
 from avtorch.inference.estimators.kalman import JointEKF, JointUKF
 from avtorch.inference.estimators.other_posteriors import ImportanceSampling, MaximumAPosteriori
 from avtorch.inference.estimators.rls import RecursiveLeastSquares
-from avtorch.inference.estimators.windowed import Estimator, WindowedEstimator
+from avtorch.inference.estimators.windowed import WindowedEstimator
 from avtorch.inference.form import Form
 from avtorch.inference.sequential import SequentialInference
 
-ESTIMATORS: dict[str, type[SequentialInference] | type[WindowedEstimator]] = {
+ESTIMATORS: dict[str, type[Estimator]] = {
     "sgld": SequentialInference,
     "importance": ImportanceSampling,
     "map": MaximumAPosteriori,
@@ -50,6 +51,7 @@ def make_estimator(name: str, form: Form, *, vehicles: int = 1, **options: Any) 
             raise InputError(f"{option}: the estimator {name!r} has no such option; it has {', '.join(known)}")
     if issubclass(made, WindowedEstimator):
         return made(form, vehicles=vehicles, **options)
+    assert issubclass(made, SequentialInference)
     options.setdefault("settings", form.sampler)
     return made(vehicles=vehicles, names=form.names, noise_prior=form.noise_prior, **options)
 

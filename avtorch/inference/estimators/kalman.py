@@ -18,7 +18,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -31,6 +31,7 @@ from avtorch.inference.form import Form, JerkForm, Rows
 from avtorch.inference.jerk import JerkStatistics
 from avtorch.inference.latent import GAP, NOISE_PRIOR, LatentForm
 from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, Step, discretise, initial_covariance
+from avtorch.inference.priors import LogNormalPrior
 
 PLAUSIBLE = ((0.01, 20.0), (0.02, 20.0))
 """Bounds of ``T_L`` [s] and ``K_L``; a filter that leaves them has diverged, and restarts from the prior."""
@@ -59,47 +60,11 @@ class Observation:
     dt: Float[Tensor, ""]
 
 
-class StateModel(Protocol):
-    """A state-space model, batched over vehicles; ``x`` is ``(..., vehicle, d)``."""
-
-    @property
-    def variance(self) -> Float[Tensor, "vehicle channel"]:
-        """Variance of every channel's noise, ``(vehicle, channel)``."""
-        ...
-
-    def start(self, actuation: GaussianState, row: Observation) -> GaussianState:
-        """The state at the first row of a run, given the belief in ``(log T_L, log K_L)``."""
-        ...
-
-    def advance(self, x: Float[Tensor, "*point vehicle d"], row: Observation) -> Float[Tensor, "*point vehicle d"]:
-        """The state a step later without noise, shape of ``x``."""
-        ...
-
-    def slope(self, x: Float[Tensor, "*point vehicle d"], row: Observation) -> Float[Tensor, "*point vehicle d d"]:
-        """Derivative of :meth:`advance`, ``(..., vehicle, d, d)``."""
-        ...
-
-    def noise(self, x: Float[Tensor, "vehicle d"], row: Observation) -> Float[Tensor, "*vehicle d d"]:
-        """Covariance of the step's noise, ``(vehicle, d, d)``, at ``x`` ``(vehicle, d)``."""
-        ...
-
-    def observe(
-        self, x: Float[Tensor, "*point vehicle d"], row: Observation, channel: int
-    ) -> Float[Tensor, "*point vehicle"]:
-        """The channel's reading without noise, ``(..., vehicle)``."""
-        ...
-
-    def observed_slope(
-        self, x: Float[Tensor, "*point vehicle d"], row: Observation, channel: int
-    ) -> Float[Tensor, "*point vehicle d"]:
-        """Derivative of :meth:`observe`, ``(..., vehicle, d)``."""
-        ...
-
-
 class JerkState:
     """``(log T_L, log K_L)`` as a random walk, observed through Eq. 1: ``jerk = (K_L u - a)/T_L + N(0, sigma^2)``.
 
     `sigma`: jerk noise [m/s³], ``(vehicle,)``. `drift`: SD of the walk per square root of a second, of both logarithms.
+    ``variance``: of every channel's noise, ``(vehicle, channel)``.
     """
 
     def __init__(self, sigma: Float[Tensor, " vehicle"], drift: float) -> None:
@@ -108,26 +73,32 @@ class JerkState:
         self._still = torch.eye(2, dtype=sigma.dtype, device=sigma.device)
 
     def start(self, actuation: GaussianState, row: Observation) -> GaussianState:
+        """The state at the first row of a run, given the belief in ``(log T_L, log K_L)``."""
         return actuation
 
     def advance(self, x: Float[Tensor, "*point vehicle 2"], row: Observation) -> Float[Tensor, "*point vehicle 2"]:
+        """The state a step later without noise, shape of ``x``."""
         return x
 
     def slope(self, x: Float[Tensor, "*point vehicle 2"], row: Observation) -> Float[Tensor, "*point vehicle 2 2"]:
+        """Derivative of :meth:`advance`, ``(..., vehicle, d, d)``."""
         return self._still.expand(*x.shape, 2)
 
     def noise(self, x: Float[Tensor, "vehicle 2"], row: Observation) -> Float[Tensor, "2 2"]:
+        """Covariance of the step's noise at ``x`` ``(vehicle, d)``, broadcastable to ``(vehicle, d, d)``."""
         return row.dt * self._walk
 
     def observe(
         self, x: Float[Tensor, "*point vehicle 2"], row: Observation, channel: int
     ) -> Float[Tensor, "*point vehicle"]:
+        """The channel's reading without noise, ``(..., vehicle)``."""
         log_T, log_K = x.unbind(-1)
         return (log_K.exp() * row.u - row.a) * (-log_T).exp()
 
     def observed_slope(
         self, x: Float[Tensor, "*point vehicle 2"], row: Observation, channel: int
     ) -> Float[Tensor, "*point vehicle 2"]:
+        """Derivative of :meth:`observe`, ``(..., vehicle, d)``."""
         by_gain = (x[..., 1] - x[..., 0]).exp() * row.u
         return torch.stack([(-x[..., 0]).exp() * row.a - by_gain, by_gain], -1)
 
@@ -206,6 +177,10 @@ class LatentState:
         return self._rows[channel].expand_as(x)
 
 
+StateModel = JerkState | LatentState
+"""A state-space model, batched over vehicles; ``x`` is ``(..., vehicle, d)``. Methods are described at `JerkState`."""
+
+
 class JointKalman(WindowedEstimator):
     """A filter over the state and ``(log T_L, log K_L)``; subclasses pass a normal through the non-linear model.
 
@@ -234,10 +209,13 @@ class JointKalman(WindowedEstimator):
         super().__init__(form, **options)
         self.drift = drift
         self.noise = {name: NOISE_PRIOR[name][0] for name in levels} | dict(noise or {})
-        prior = self.actuation_prior
+        prior = self.first_prior.actuation
+        if not isinstance(prior, LogNormalPrior):
+            raise InputError(f"actuation_prior: found a {type(prior).__name__}, a filter needs a LogNormalPrior")
+        self._first = GaussianState(prior.median.log()[None], torch.diag(prior.log_sd.square())[None])
         self._memory = {
-            "mean": prior.median.log().expand(self.vehicles, 2).clone(),
-            "cov": torch.diag(prior.log_sd.square()).expand(self.vehicles, 2, 2).clone(),
+            "mean": self._first.mean.expand(self.vehicles, 2).clone(),
+            "cov": self._first.cov.expand(self.vehicles, 2, 2).clone(),
         }
 
     @abstractmethod
@@ -308,13 +286,8 @@ class JointKalman(WindowedEstimator):
             noise_z, noise_var = sigma.log().unsqueeze(-1), (0.5 / statistics.n.clamp_min(1.0)).unsqueeze(-1)
         found, likelihood = self.filter(model, actuation, rows, columns)
         converged = _plausible(found) & likelihood.isfinite()
-        prior_mean, prior_cov = self.actuation_prior.median.log(), torch.diag(self.actuation_prior.log_sd.square())
-        mean = torch.where(converged[:, None], found.mean, prior_mean)
-        cov = torch.where(converged[:, None, None], found.cov, prior_cov)
-        self._memory = {
-            "mean": self._memory["mean"].index_put((index,), mean),
-            "cov": self._memory["cov"].index_put((index,), cov),
-        }
+        mean, cov = _where(converged, found, self._first)
+        self._remember(index, mean=mean, cov=cov)
         whole = torch.diag_embed(torch.cat([torch.zeros_like(mean), noise_var], -1))
         whole[:, :2, :2] = cov
         mean_z = torch.cat([mean, noise_z], -1)

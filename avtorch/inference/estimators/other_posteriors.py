@@ -38,7 +38,7 @@ class MaximumAPosteriori(SequentialInference):
             mode.covariance,
             torch.eye(mode.z.shape[-1], dtype=mode.z.dtype, device=mode.z.device),
         )
-        summary = Summary.log_normal(mode.z, covariance, len(self.belief.draws), self.generator)
+        summary = Summary.log_normal(mode.z, covariance, self.kept, self.generator)
         return summary, mode.z, covariance, converged
 
 
@@ -81,7 +81,7 @@ class ImportanceSampling(SequentialInference):
 
     def _drawn(self, density: Density, mode: Mode, settings: ImportanceSettings) -> _Solved:
         draws = weighted_draws(density, settings, generator=self.generator, mode=mode)
-        summary = _summary(draws, len(self.belief.draws), self.generator)
+        summary = _summary(draws, self.kept, self.generator)
         return _Solved(summary, *draws.moments(), mode.converged & draws.converged(settings))
 
     def _chains(self, density: Density, mode: Mode) -> _Solved:

@@ -61,9 +61,7 @@ class RecursiveLeastSquares(WindowedEstimator):
         a, u, jerk = (torch.where(usable, rows[name], 0.0) * root for name in ("accel", "accel_cmd", "jerk"))
         new = replace(JerkStatistics.from_samples(a, u, jerk), n=root.square().sum(-1))
         old = self.forgetting ** usable.sum(-1)
-        for name in _SUMS:
-            remembered = old * self._memory[name][index] + getattr(new, name)
-            self._memory[name] = self._memory[name].index_put((index,), remembered)
+        self._remember(index, **{name: old * self._memory[name][index] + getattr(new, name) for name in _SUMS})
         return self._summary(JerkStatistics(**{name: self._memory[name][index] for name in _SUMS}))
 
     def _summary(self, s: JerkStatistics) -> tuple[Summary, Tensor]:

@@ -190,7 +190,7 @@ def test_a_filter_that_diverges_begins_anew(kind):
     before = loop.belief
     found, converged = loop._learn(rows_of(a, u, -glvd_jerk(a, u, 0.3, 1.0)), torch.tensor([0]))
     assert not converged.any()
-    assert loop._memory["mean"].equal(loop.actuation_prior.median.log()[None])
+    assert loop._memory["mean"].equal(loop.first_prior.actuation.median.log()[None])
     after = before.updated(torch.tensor([True]), torch.tensor([0]), found, converged)
     assert after.draws.equal(before.draws)
 

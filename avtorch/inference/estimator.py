@@ -1,0 +1,79 @@
+"""What every estimator in a stream of windows shares: a belief per vehicle, what it remembers beside it, and resume."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.inference.belief import Belief
+from avtorch.inference.device import Device, checked_device, generator_on
+from avtorch.inference.form import Rows, WindowLikelihood
+from avtorch.inference.priors import Joint, Prior, default_actuation_prior, prior_on
+from avtorch.inference.state import about, shaped_as
+
+
+class Estimator(ABC):
+    """Takes the windows of many vehicles one after another and keeps a belief about them.
+
+    A window that is not excited leaves the belief of its vehicle as it was. Memory does not grow with the windows.
+
+    Args:
+        names: parameters of the belief, ``T_L`` and ``K_L`` first.
+        noise_prior: of the others.
+        actuation_prior: of ``(T_L [s], K_L [-])`` before the first excited window.
+        kept: draws per vehicle that a belief carries.
+        device: where belief and memory are, and what `take` is given has to be.
+
+    Raises `InputError` for fewer than two draws or one vehicle, or a device that this machine lacks.
+    """
+
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        noise_prior: Prior,
+        *,
+        vehicles: int = 1,
+        actuation_prior: Prior | None = None,
+        kept: int = 1000,
+        seed: int = 0,
+        device: Device = "cpu",
+    ) -> None:
+        if kept < 2 or vehicles < 1:
+            raise InputError(f"kept, vehicles: found {kept}, {vehicles}, need 2 or more draws and 1 or more vehicles")
+        self.kept, self.vehicles, self.device = kept, vehicles, checked_device(device)
+        actuation = default_actuation_prior() if actuation_prior is None else actuation_prior
+        self.first_prior = Joint(prior_on(actuation, self.device), prior_on(noise_prior, self.device))
+        self.generator = generator_on(self.device, seed)
+        self.belief = Belief.of_prior(names, self.first_prior, kept, vehicles, self.generator)
+        self._memory: dict[str, Tensor] = {}  # one entry a vehicle
+
+    @abstractmethod
+    def take(self, rows: Rows, likelihood: WindowLikelihood) -> Belief:
+        """Take in one window: its rows, each column ``(vehicle, time)``, and what the form makes of them."""
+
+    def _remember(self, index: Tensor, **found: Tensor) -> None:
+        """Keep what was found of the vehicles ``index``."""
+        self._memory |= {name: self._memory[name].index_put((index,), value) for name, value in found.items()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to continue bit for bit; plain tensors, on the processor, and names."""
+        memory = {name: value.cpu().clone() for name, value in self._memory.items()}
+        return {**self.belief.state_dict(), "memory": memory, "generator": self.generator.get_state()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`.
+
+        Raises `InputError` if it was saved by an estimator of other parameters, vehicles or settings, or has other
+        shapes or types than this one saves; nothing is then changed.
+        """
+        own = self.state_dict()
+        if about(state, "mode") != about(own, "mode"):
+            found, needed = about(state, "mode"), about(own, "mode")
+            raise InputError(f"state: (mode, names, vehicles) were {found} when it was saved, here they are {needed}")
+        shaped_as(own, state, "state")
+        self.belief = self.belief.taken_from(state)
+        self._memory = {name: value.clone().to(self.device) for name, value in state["memory"].items()}
+        self.generator.set_state(state["generator"])
