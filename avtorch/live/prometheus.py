@@ -40,12 +40,6 @@ class Metrics:
         if seconds is not None:
             self._latency.observe(seconds)
 
-    def text(self) -> str:
-        """The page."""
-        from prometheus_client import generate_latest
-
-        return generate_latest(self.registry).decode()
-
     def start(self, host: str, port: int) -> int:
         """Serve the page; returns the port, for `port` 0 a free one."""
         from prometheus_client import start_http_server

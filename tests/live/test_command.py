@@ -93,7 +93,7 @@ def test_a_followed_file_stopped_in_its_midst_and_gone_on_with(here: Path, numbe
     if number != signal.SIGKILL:
         assert first.returncode == 0, err
         assert b"state kept in state" in err
-        assert (here / "state" / "source.json").exists()
+        assert (here / "state" / "watch.state").exists()
     with (here / "live.jsonl").open("ab") as stream:
         stream.write(text[half:])
     second = started(here, *arguments)
