@@ -171,15 +171,11 @@ _KEPT = ("windows", "p_string_stable", "_ahead", "_suspects", "_pending", "_in_w
 
 
 class LiveCar:
-    """The watch of one car, fed row by row. `signals` are those of its first row.
-
-    Raises `InputError` where they do not suffice for a form.
-    """
+    """The watch of one car, fed row by row. `signals` are those of its first row, which suffice for a form."""
 
     def __init__(self, name: str, signals: set[str], settings: LiveSettings, counts: Counts) -> None:
         form = settings.form_of(signals)
-        if form is None:
-            raise InputError(f"{name}: found {', '.join(sorted(signals))}; needs accel_cmd, and accel or speed")
+        assert form is not None
         self.name, self.settings, self.counts = name, settings, counts
         self._setting = settings.setting()
         self.form: Form = form
