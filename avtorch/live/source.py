@@ -97,8 +97,7 @@ class Counts:
 
     def to_dict(self) -> dict[str, Any]:
         """The numbers as plain objects."""
-        own = {name: getattr(self, name) for name in ("rows", "reordered", "windows", "repeated")}
-        return {**own, "refused": dict(self.refused), "alerts": dict(self.alerts)}
+        return {**vars(self), "refused": dict(self.refused), "alerts": dict(self.alerts)}
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Go on from `to_dict`."""
