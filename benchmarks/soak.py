@@ -146,7 +146,7 @@ class Stretch:
                 for line in part.lines[first : first + 500]:
                     number += 1
                     if start is None or number > start:
-                        row = self.parser.row(line, number)
+                        row = self.parser.row(line)
                         if row is not None:
                             rows.append(row)
                 yield Batch(rows, number)

@@ -116,11 +116,10 @@ def watch(
         open_.callback(sink.close)
         answered = None
         if address is not None:
-            metrics = Metrics(monitor)
-            port = metrics.start(*address)
+            metrics = Metrics(monitor, *address)
             open_.callback(metrics.close)
             answered = metrics.answered
-            talk.err.print(f"Metrics: http://{address[0]}:{port}/metrics", highlight=False)
+            talk.err.print(f"Metrics: http://{address[0]}:{metrics.port}/metrics", highlight=False)
         with stopped_by_signals(stop):
             try:
                 watch_source(rows, monitor, [sink], stop=stop, kept=kept, answered=answered)

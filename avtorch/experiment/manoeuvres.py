@@ -143,10 +143,6 @@ class Manoeuvre:
             and self.time[-1] <= limits.seconds + 1e-9
         )
 
-    def expecting(self, speed: FloatArray) -> Manoeuvre:
-        """The same with another expected speed (row,)."""
-        return replace(self, speed=speed)
-
     def trimmed(self, gain: float, start: float | None = None) -> Manoeuvre:
         """The same with an extra change of speed of `gain` [m/s] spread over its commands, most over the gentlest.
 

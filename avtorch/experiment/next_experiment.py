@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -171,7 +171,7 @@ def _expected(first: PredictiveModel, manoeuvres: tuple[Manoeuvre, ...], limits:
             level = [v - (v[-1] - v[0]) * np.linspace(0.0, 1.0, len(v)) for v in speeds]
             offers = [m.trimmed(-float(v[-1] - v[0]) / K_L) for m, v in zip(offers, speeds, strict=True)]
             speeds = level
-        offers = [m.expecting(v) for m, v in zip(offers, speeds, strict=True)]
+        offers = [replace(m, speed=v) for m, v in zip(offers, speeds, strict=True)]
     return [m for m in offers if m.within(limits)]
 
 

@@ -81,8 +81,6 @@ def _local(workers: int, memory: str) -> Iterator[Cluster]:
     from dask import config
     from distributed import Client, LocalCluster
 
-    if workers < 1:
-        raise InputError(f"workers: found {workers}, needs 1 or more")
     shown = importlib.util.find_spec("bokeh") is not None
     with config.set(_LOCAL):
         cluster = LocalCluster(

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from scipy.stats import false_discovery_control
 from torch import Tensor
 
 from avtorch.fleet.folder import LEAST_SD, QUANTITIES, Drive
@@ -122,7 +123,8 @@ def population(cars: Mapping[str, Sequence[Drive]], seed: int = 0) -> tuple[dict
         common[name] = {"typical": interval(pooling.mean[:, i].exp()), **pooling.spreads(i)}
     others, own = left_out(pooling.margin)
     means, sds = pooling.each_car()
-    apart = _q_values((2 * own.amin(0)).clamp(max=1.0).tolist())
+    # smallest expected share of false ones at which each would be among those named (Benjamini and Hochberg 1995)
+    apart = false_discovery_control((2 * own.amin(0)).clamp(max=1.0).numpy()).tolist()
     beside: dict[str, Any] = {}
     for c, name in enumerate(pooling.names):
         beside[name] = {"q_value": apart[c]}
@@ -138,16 +140,6 @@ def population(cars: Mapping[str, Sequence[Drive]], seed: int = 0) -> tuple[dict
                 "tail": float(own[i, c]),
             }
     return common, beside
-
-
-def _q_values(p: Sequence[float]) -> list[float]:
-    """Smallest expected share of false ones at which each would be among those named (Benjamini and Hochberg 1995)."""
-    order = sorted(range(len(p)), key=p.__getitem__, reverse=True)
-    found, least = [1.0] * len(p), 1.0
-    for place, i in enumerate(order):
-        least = min(least, p[i] * len(p) / (len(p) - place))
-        found[i] = least
-    return found
 
 
 GRID = (32, 24)

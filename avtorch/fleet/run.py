@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,38 +89,26 @@ def run_fleet(
     found = logs if isinstance(logs, LogList) else find_logs(logs, leave_out=out)
     folder = FleetFolder(Path(out))
     with sole_use(out, work="a fleet"):
-        plan = _plan(found.logs, folder, given, retry=retry, report=report, progress=steps)
-        if plan.tasks:
-            with connected(min(workers or _cores(), len(plan.tasks)), memory, scheduler) as cluster:
+        tasks, kept, notes = _plan(found.logs, folder, given, retry=retry, report=report, progress=steps)
+        if tasks:
+            with connected(min(workers or _cores(), len(tasks)), memory, scheduler) as cluster:
                 if connected_to is not None:
                     connected_to(cluster)
-                cost, failed = 0, 0
-                for number, (task, outcome) in enumerate(worked_off(cluster.client, plan.tasks), 1):
+                cost, of, failed = 0, sum(_COST[task.step] for task in tasks), 0
+                for number, (task, outcome) in enumerate(worked_off(cluster.client, tasks), 1):
                     key = task_key(task.step, task.sha256, given)
                     about = {"sha256": task.sha256, "seconds": outcome.seconds, "report": outcome.report}
                     failed += folder.write(task.step, task.log, key, outcome.rows, **about) != "done"
                     cost += _COST[task.step]
                     if steps is not None:
-                        kept = f", {plan.kept} kept" if plan.kept else ""
-                        words = f"{number} of {len(plan.tasks)} answers, {failed} failed{kept}"
-                        steps(words, cost, sum(_COST[task.step] for task in plan.tasks))
+                        also = f", {kept} kept" if kept else ""
+                        words = f"{number} of {len(tasks)} answers, {failed} failed{also}"
+                        steps(words, cost, of)
         answer = fleet_answer(found, folder, given)
-        answer["notes"] += plan.notes
-        answer["work"] = {"kept": plan.kept, "computed": len(plan.tasks)}
+        answer["notes"] += notes
+        answer["work"] = {"kept": kept, "computed": len(tasks)}
         write_json(Path(out) / FLEET, answer)
     return answer
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """The `tasks` that are missing; `kept`: number of answers that are there.
-
-    `notes`: a sentence on each log that cannot be read now, but could in an earlier call.
-    """
-
-    tasks: list[Task]
-    kept: int
-    notes: list[str]
 
 
 def _plan(
@@ -132,7 +119,9 @@ def _plan(
     retry: bool,
     report: Callable[[Diagnosis], str] | None,
     progress: Callable[[str, int, int], None] | None,
-) -> _Plan:
+) -> tuple[list[Task], int, list[str]]:
+    """The tasks that are missing; the number of answers that are there; and a sentence on each log that cannot be read
+    now, but could in an earlier call."""
     tasks: list[Task] = []
     unread: dict[str, str] = {}
     kept = 0
@@ -159,7 +148,7 @@ def _plan(
                     tasks.append(Task(step, log, log.identity, sha256, size, settings, report))
     # what is soon done first, and the longest diagnoses before the short ones, which then fill the last gaps
     tasks.sort(key=lambda task: (STEPS.index(task.step), -task.size))
-    return _Plan(tasks, kept, list(unread.values()))
+    return tasks, kept, list(unread.values())
 
 
 def _content(log: FleetLog) -> tuple[str, int] | str:

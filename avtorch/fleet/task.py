@@ -6,7 +6,6 @@ Whatever goes wrong becomes a row that says why.
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -138,18 +137,23 @@ def worked_off(client: Any, tasks: Sequence[Task]) -> Iterator[tuple[Task, Outco
     """What `work` returns for each of the `tasks`, as they are done, begun in the order given.
 
     A task whose worker ends is done again by another one, as often as the scheduler allows; then its outcome is a row
-    that says so. As many tasks run at a time as the cluster has threads, so that a worker that ends costs its own: Dask
-    suspects every task that a worker had. Raises `InputError` where the scheduler is lost, or no worker comes back.
+    that says so, and the log's later steps are not tried. As many tasks run at a time as the cluster has threads, one
+    of a log, so that a worker that ends costs its own: Dask suspects every task that a worker had. Raises `InputError`
+    where the scheduler is lost, or no worker comes back.
     """
     from distributed import KilledWorker, as_completed
     from distributed.scheduler import NoWorkerError
 
-    waiting = deque(tasks)
+    waiting = list(tasks)
     running: dict[str, Task] = {}
     futures = as_completed([], with_results=True, raise_errors=False, loop=client.loop)
     while waiting or running:
-        while waiting and len(running) < max(1, sum(client.nthreads().values())):
-            task = waiting.popleft()
+        while len(running) < max(1, sum(client.nthreads().values())):
+            busy = {task.place for task in running.values()}
+            task = next((task for task in waiting if task.place not in busy), None)
+            if task is None:
+                break
+            waiting.remove(task)
             running[task.name] = task
             futures.add(client.submit(work, task, key=task.name))
         done, result = next(futures)
@@ -162,8 +166,14 @@ def worked_off(client: Any, tasks: Sequence[Task]) -> Iterator[tuple[Task, Outco
         fault = done.exception()
         if isinstance(fault, NoWorkerError):
             raise InputError("memory: no worker lives within it, needs more, such as 2GiB; what was done is kept")
-        killed = "its worker ended each time: killed, or beyond its memory"
-        yield (
-            task,
-            Outcome(failure_rows("crashed", killed if isinstance(fault, KilledWorker) else one_line(fault)), 0.0),
-        )
+        if not isinstance(fault, KilledWorker):
+            yield task, _crashed(one_line(fault))
+            continue
+        yield task, _crashed("its worker ended each time: killed, or beyond its memory")
+        for later in [other for other in waiting if other.place == task.place]:
+            waiting.remove(later)
+            yield later, _crashed("not tried: its worker ended at an earlier step")
+
+
+def _crashed(why: str) -> Outcome:
+    return Outcome(failure_rows("crashed", why), 0.0)

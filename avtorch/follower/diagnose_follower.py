@@ -16,9 +16,19 @@ from avtorch.arrays import FloatArray
 from avtorch.display import Card, Displayed, Frame
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.follower.closed_loop import LoopErrors, LoopStability, keeps_speed, loop_errors, loop_stability
 from avtorch.follower.identify import Followed, Identified, car_of, followed, identified, seen_in, widened
-from avtorch.follower.laws import LAWS, FollowerMeasurements, HeadwayLaw, law_named, of_law
+from avtorch.follower.laws import (
+    LAWS,
+    FollowerMeasurements,
+    HeadwayLaw,
+    LoopErrors,
+    LoopStability,
+    keeps_speed,
+    law_named,
+    loop_errors,
+    loop_stability,
+    of_law,
+)
 from avtorch.gap.diagnose import diagnose
 from avtorch.gap.quantity import Quantity, frame_of
 from avtorch.gap.result.diagnosis import Diagnosis

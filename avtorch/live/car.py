@@ -167,19 +167,15 @@ class Answer(NamedTuple):
     ended: float | None
 
 
-_KEPT = ("windows", "position", "p_string_stable", "_ahead", "_suspects", "_pending", "_in_window", "_closes", "_last")
+_KEPT = ("windows", "p_string_stable", "_ahead", "_suspects", "_pending", "_in_window", "_closes", "_last")
 
 
 class LiveCar:
-    """The watch of one car, fed row by row. `signals` are those of its first row.
-
-    Raises `InputError` where they do not suffice for a form.
-    """
+    """The watch of one car, fed row by row. `signals` are those of its first row, which suffice for a form."""
 
     def __init__(self, name: str, signals: set[str], settings: LiveSettings, counts: Counts) -> None:
         form = settings.form_of(signals)
-        if form is None:
-            raise InputError(f"{name}: found {', '.join(sorted(signals))}; needs accel_cmd, and accel or speed")
+        assert form is not None
         self.name, self.settings, self.counts = name, settings, counts
         self._setting = settings.setting()
         self.form: Form = form
@@ -189,7 +185,6 @@ class LiveCar:
         self._limits = tuple(LIMITS[x] for x in self.columns)
         self.watch = settings.watch(name, form)
         self.order = ReorderBuffer(settings.lateness, _WAITING)
-        self.position: int | None = None
         self.windows = 0
         self.p_string_stable = math.nan
         self._ahead = 0.0
@@ -335,21 +330,21 @@ class LiveCar:
 
     def state_dict(self) -> dict[str, Any]:
         """All that later windows depend on, as tensors and plain values."""
-        own = {name: getattr(self, name) for name in _KEPT}
-        return {"car": self.name, "columns": self.columns, "watch": self.watch.state_dict(), "own": own} | {
-            "order": vars(self.order)
+        return {
+            "car": self.name,
+            "columns": self.columns,
+            "watch": self.watch.state_dict(),
+            "order": vars(self.order),
+            "own": {name: getattr(self, name) for name in _KEPT},
         }
 
     @classmethod
     def restored(cls, state: Mapping[str, Any], settings: LiveSettings, counts: Counts) -> LiveCar:
-        """A car that goes on from `state_dict` to the bit. Raises `InputError` for anything else."""
-        try:
-            car = cls(state["car"], set(state["columns"]), settings, counts)
-            car.watch.load_state_dict(state["watch"])
-            vars(car).update({name: state["own"][name] for name in _KEPT})
-            vars(car.order).update(state["order"])
-        except (KeyError, TypeError) as fault:
-            raise InputError(f"state: is not a car's ({type(fault).__name__})") from None
+        """A car that goes on from `state_dict` to the bit."""
+        car = cls(state["car"], set(state["columns"]), settings, counts)
+        car.watch.load_state_dict(state["watch"])
+        vars(car).update(state["own"])
+        vars(car.order).update(state["order"])
         return car
 
 
@@ -375,19 +370,11 @@ class LiveWatch:
 
     def take(self, batch: Batch) -> list[Answer]:
         """Take in a batch; returns what is to be said, in the order of the rows that ended the windows."""
-        if batch.anew:
-            for car in self.cars.values():
-                car.position = None
         answers: list[Answer] = []
         for row in batch.rows:
             car = self.cars.get(row.car) or self._new(row)
-            if car is None:
-                continue
-            if row.position is not None:
-                if car.position is not None and row.position <= car.position:
-                    continue  # taken in before a restart
-                car.position = row.position
-            answers += car.take(row, batch.arrived)
+            if car is not None:
+                answers += car.take(row, batch.arrived)
         return answers
 
     def flush(self, arrived: float) -> list[Answer]:

@@ -117,7 +117,6 @@ class MqttSource:
     def __init__(self, address: MqttAddress, parser: LineParser, *, client_id: str | None = None) -> None:
         self.address, self.parser = address, parser
         self.name = address.name
-        self.reconnects = 0
         self._rows: list[Row] = []
         self._refused: str | None = None
         self._client = _client(address, client_id)
@@ -150,7 +149,6 @@ class MqttSource:
         time.sleep(RECONNECT_S)
         with contextlib.suppress(OSError, ValueError):  # tried again a second later
             self._client.reconnect()
-            self.reconnects += 1
 
     def _on_connect(self, client: Any, userdata: Any, flags: Any, code: Any, properties: Any) -> None:
         if code.is_failure:

@@ -36,13 +36,12 @@ class PlayedLog:
         *,
         map: Pairs = None,
         unit: Pairs = None,
-        stamp: Pairs = None,
         rate: float | None = None,
         car: str | None = None,
     ) -> None:
         if rate is not None and not (np.isfinite(rate) and rate > 0):
             raise InputError(f"rate: found {rate:g}, needs a finite number above 0")
-        log = Log.read(path, map=map, unit=unit, stamp=stamp)
+        log = Log.read(path, map=map, unit=unit)
         if log.accel_cmd is None:
             raise no_command(log, "; T_L and K_L need the demanded acceleration")
         self.name, self.rate = str(path), rate
@@ -73,7 +72,4 @@ class PlayedLog:
     def _rows(self, first: int, end: int) -> list[Row]:
         part = {name: values[first:end].tolist() for name, values in self._signals.items()}
         times = self._time[first:end].tolist()
-        return [
-            Row(self.car, t, {name: values[i] for name, values in part.items()}, first + i + 1)
-            for i, t in enumerate(times)
-        ]
+        return [Row(self.car, t, {name: values[i] for name, values in part.items()}) for i, t in enumerate(times)]

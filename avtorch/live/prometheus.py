@@ -17,64 +17,33 @@ BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
 
 class Metrics:
-    """Metrics of `watch` under `http://HOST:PORT/metrics`, served by a thread from `start` to `close`.
+    """Metrics of `watch` under `http://HOST:PORT/metrics`, served by a thread until `close`; `port` 0: a free one.
 
-    Raises `InputError` where prometheus-client is missing, and from `start` for a port that is taken.
+    Raises `InputError` where prometheus-client is missing, and for a port that is taken.
     """
 
-    def __init__(self, watch: LiveWatch) -> None:
+    def __init__(self, watch: LiveWatch, host: str, port: int) -> None:
         if importlib.util.find_spec("prometheus_client") is None:
             raise InputError(f"--prometheus needs prometheus-client, which is not installed: {INSTALL}")
-        from prometheus_client import CollectorRegistry, Histogram
+        from prometheus_client import CollectorRegistry, Histogram, start_http_server
 
         self.watch = watch
-        self.registry = CollectorRegistry(auto_describe=False)
-        self.registry.register(_OfWatch(watch))  # type: ignore[arg-type]
+        registry = CollectorRegistry(auto_describe=False)
+        registry.register(self)  # type: ignore[arg-type]
         about = "From the arrival of the row that ended a window to its answer's being written"
-        self._latency = Histogram("avtorch_latency_seconds", about, buckets=BUCKETS, registry=self.registry)
-        self._server: Any = None
-        self._thread: Any = None
-
-    def answered(self, answer: Answer, car: LiveCar, seconds: float | None) -> None:
-        """As an observer of `watch_source`."""
-        if seconds is not None:
-            self._latency.observe(seconds)
-
-    def text(self) -> str:
-        """The page."""
-        from prometheus_client import generate_latest
-
-        return generate_latest(self.registry).decode()
-
-    def start(self, host: str, port: int) -> int:
-        """Serve the page; returns the port, for `port` 0 a free one."""
-        from prometheus_client import start_http_server
-
+        self._latency = Histogram("avtorch_latency_seconds", about, buckets=BUCKETS, registry=registry)
         try:
-            self._server, self._thread = start_http_server(port, addr=host, registry=self.registry)
+            self._server, self._thread = start_http_server(port, addr=host, registry=registry)
         except (OSError, OverflowError) as fault:
             why = fault.strerror if isinstance(fault, OSError) else fault
             raise InputError(f"--prometheus: {host}:{port} cannot be served ({why})") from None
-        return int(self._server.server_port)
-
-    def close(self) -> None:
-        """End the page."""
-        if self._server is not None:
-            self._server.shutdown()
-            self._server.server_close()
-            self._thread.join()
-
-
-class _OfWatch:
-    """The numbers of a watch, as Prometheus collects them; read by another thread than the one that counts."""
-
-    def __init__(self, watch: LiveWatch) -> None:
-        self._watch = watch
+        self.port = int(self._server.server_port)
 
     def collect(self) -> Iterator[Any]:
+        """The numbers of the watch, as Prometheus asks for them, by another thread than the one that counts."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-        counts, cars = self._watch.counts, list(self._watch.cars.values())
+        counts, cars = self.watch.counts, list(self.watch.cars.values())
         plain = {"rows": "Rows taken in", "reordered": "Rows put in their place", "windows": "Windows answered"}
         for name, about in plain.items():
             yield CounterMetricFamily(f"avtorch_{name}", about, value=getattr(counts, name))
@@ -93,3 +62,14 @@ class _OfWatch:
             if car.windows:
                 stable.add_metric([car.name], car.p_string_stable)
         yield stable
+
+    def answered(self, answer: Answer, car: LiveCar, seconds: float | None) -> None:
+        """For `watch_source`."""
+        if seconds is not None:
+            self._latency.observe(seconds)
+
+    def close(self) -> None:
+        """End the page."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()

@@ -1,4 +1,4 @@
-"""What every live source gives: rows of cars, in batches of bounded size, when it is asked for them.
+"""What every live source gives, rows of cars in batches of bounded size, and those of lines: standard input and files.
 
 A source is pulled. What it has not been asked for stays in the pipe, the file or the broker's queue, so that memory
 does not grow where the estimate is behind. What becomes of messages that are no rows is counted by kind, and no line
@@ -9,42 +9,41 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import select
 import time
 from collections import Counter
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from threading import Event
-from typing import Any, NamedTuple, Protocol
+from typing import Any, BinaryIO, NamedTuple, Protocol
 
 import numpy as np
 
 from avtorch.errors import InputError, printable
 from avtorch.io.mapping import Pairs, pairs
+from avtorch.io.opening import opened
 from avtorch.io.units import to_si
 from avtorch.numeral import numeral
 
 
 class Row(NamedTuple):
     """One row of one car: its `time` [s] on the car's own clock, and `signals` in SI units, as numbers or as a source
-    found them. `position` in the source, None where it has none; it only ever grows.
+    found them.
     """
 
     car: str
     time: float
     signals: Mapping[str, Any]
-    position: int | None = None
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Rows read at once, maybe none; `position` in the source behind them; `arrived` when (`time.monotonic`).
-
-    `anew`: positions count from 0 again from this batch on, as where a file was replaced.
-    """
+    """Rows read at once, maybe none; `position` in the source behind them; `arrived` when (`time.monotonic`)."""
 
     rows: list[Row]
     position: int | None = None
-    anew: bool = False
     arrived: float = field(default_factory=time.monotonic)
 
 
@@ -98,8 +97,7 @@ class Counts:
 
     def to_dict(self) -> dict[str, Any]:
         """The numbers as plain objects."""
-        own = {name: getattr(self, name) for name in ("rows", "reordered", "windows", "repeated")}
-        return {**own, "refused": dict(self.refused), "alerts": dict(self.alerts)}
+        return {**vars(self), "refused": dict(self.refused), "alerts": dict(self.alerts)}
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Go on from `to_dict`."""
@@ -139,7 +137,7 @@ class LineParser:
         self.header: list[str] | None = None
         """Of CSV; empty where the first line was JSON. None before it, as where another file takes the place."""
 
-    def row(self, line: bytes, position: int | None = None) -> Row | None:
+    def row(self, line: bytes) -> Row | None:
         """The row of a line; None for an empty line, a header, and what was counted as refused."""
         if not line.strip():
             return None
@@ -149,7 +147,7 @@ class LineParser:
                 self.header = []
         if len(line) > LONGEST:
             return self._refused("corrupt")
-        return self._of_json(line, position, self.car) if self.header == [] else self._of_csv(line, position)
+        return self._of_json(line, self.car) if self.header == [] else self._of_csv(line)
 
     def message(self, payload: bytes, *, car: str) -> list[Row]:
         """The rows of a message: an object, several in a list, or one a line; `car` names the car of those without."""
@@ -157,23 +155,23 @@ class LineParser:
             self._refused("corrupt")
             return []
         if not payload.lstrip().startswith(b"["):
-            rows = [self._of_json(line, None, car) for line in payload.splitlines() if line.strip()]
+            rows = [self._of_json(line, car) for line in payload.splitlines() if line.strip()]
             return [row for row in rows if row is not None]
         try:
             found = json.loads(payload)
         except (ValueError, RecursionError):
             self._refused("corrupt")
             return []
-        return [row for one in found if (row := self._of_object(one, None, car)) is not None]
+        return [row for one in found if (row := self._of_object(one, car)) is not None]
 
-    def _of_json(self, text: bytes, position: int | None, car: str) -> Row | None:
+    def _of_json(self, text: bytes, car: str) -> Row | None:
         try:
             found = json.loads(text.decode())  # of bytes it would look for the encoding first
         except (ValueError, RecursionError):
             return self._refused("corrupt")
-        return self._of_object(found, position, car)
+        return self._of_object(found, car)
 
-    def _of_object(self, found: Any, position: int | None, car: str) -> Row | None:
+    def _of_object(self, found: Any, car: str) -> Row | None:
         if type(found) is not dict:
             return self._refused("corrupt")
         car = found.get("car", car)
@@ -188,9 +186,9 @@ class LineParser:
         if type(time) not in (float, int) or not -1e15 < time < 1e15:
             return self._refused("implausible")
         signals = {name: found[column] for name, column in self._columns if column in found}
-        return self._made(car, float(time), signals, position)
+        return self._made(car, float(time), signals)
 
-    def _of_csv(self, line: bytes, position: int | None) -> Row | None:
+    def _of_csv(self, line: bytes) -> Row | None:
         try:
             cells = [cell.strip() for cell in next(csv.reader([line.decode()]))]
         except (UnicodeDecodeError, csv.Error, StopIteration):
@@ -202,14 +200,8 @@ class LineParser:
             return None
         if len(cells) != len(self.header):
             return self._refused("corrupt")
-        found = dict(zip(self.header, cells, strict=True))
-        time = _number(found.get(self._time, ""))
-        if time is None:
-            return self._refused("incomplete")
-        if not isinstance(time, float) or not -1e15 < time < 1e15:
-            return self._refused("implausible")
-        signals = {name: _number(found[column]) for name, column in self._columns if column in found}
-        return self._made(found.get("car") or self.car, time, signals, position)
+        found = {name: cell if name == "car" else _number(cell) for name, cell in zip(self.header, cells, strict=True)}
+        return self._of_object(found | {"car": found.get("car") or self.car}, self.car)
 
     def _checked(self, cells: list[str]) -> list[str]:
         names = {name for name, column in self._columns if column in cells}
@@ -221,7 +213,7 @@ class LineParser:
             )
         return cells
 
-    def _made(self, car: str, time: float, signals: dict[str, Any], position: int | None) -> Row | None:
+    def _made(self, car: str, time: float, signals: dict[str, Any]) -> Row | None:
         try:
             car.encode()  # JSON may hold half of a surrogate pair
         except UnicodeEncodeError:
@@ -234,7 +226,7 @@ class LineParser:
                     signals[name] *= factor
         except (TypeError, OverflowError):  # an integer of four hundred digits is no float
             return self._refused("implausible")
-        return Row(car, time * self._second, signals, position)
+        return Row(car, time * self._second, signals)
 
     def _refused(self, kind: str) -> None:
         self.counts.refuse(kind)
@@ -248,3 +240,124 @@ def _number(text: str) -> float | str | None:
         return numeral(text)
     except ValueError:
         return text
+
+
+CHUNK = 2**16
+"""Bytes read at once."""
+POLL_S = 0.02
+"""How often a file is looked at for new lines [s]."""
+WAIT_S = 0.2
+"""How long standard input is waited for before the watch looks around [s]."""
+
+
+class _Lines:
+    """Bytes to rows by whole lines; `position` is behind them. A line without an end is held to a bound."""
+
+    def __init__(self, parser: LineParser, position: int = 0) -> None:
+        self.parser, self.position = parser, position
+        self._rest = b""
+
+    def rows(self, chunk: bytes) -> list[Row]:
+        """Those that end in a chunk; at the source's end, an empty one, also the one that no line end follows."""
+        *lines, self._rest = (self._rest + chunk).split(b"\n")
+        self.position += sum(len(line) + 1 for line in lines)
+        if not chunk or len(self._rest) > LONGEST:  # refused for its length, and what follows of it as no row
+            self.position += len(self._rest)
+            lines.append(self._rest)
+            self._rest = b""
+        return [row for line in lines if (row := self.parser.row(line)) is not None]
+
+
+class StreamSource:
+    """Lines of an open descriptor, standard input by default, until it ends."""
+
+    name = "standard input"
+    identity = None
+
+    def __init__(self, parser: LineParser, descriptor: int = 0) -> None:
+        self.parser, self._descriptor = parser, descriptor
+
+    def batches(self, stop: Event, start: int | None = None) -> Generator[Batch, None, None]:
+        """As the contract; there is nothing to go back to, so `start` has no meaning."""
+        lines, chunk = _Lines(self.parser), None
+        while chunk != b"" and not stop.is_set():
+            # a descriptor that is read without waiting could not be stopped while it is silent
+            if not select.select([self._descriptor], [], [], WAIT_S)[0]:
+                yield Batch([])
+                continue
+            chunk = os.read(self._descriptor, CHUNK)
+            arrived = time.monotonic()
+            yield Batch(lines.rows(chunk), arrived=arrived)
+
+
+class FileSource:
+    """Lines of a file; with `follow`, also those written to it later, and those of a file that takes its place.
+
+    Raises `InputError` where it cannot be read.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], parser: LineParser, *, follow: bool = False) -> None:
+        self.path, self.parser, self.follow = Path(path), parser, follow
+        self._file: BinaryIO | None = None
+        self._opened().close()
+
+    @property
+    def name(self) -> str:
+        return str(self.path)
+
+    @property
+    def identity(self) -> str | None:
+        """The path and the file behind it: a file that takes its place is another."""
+        found = os.stat(self.path) if self._file is None else os.fstat(self._file.fileno())
+        return f"{self.path.absolute()} {found.st_ino}"
+
+    def batches(self, stop: Event, start: int | None = None) -> Generator[Batch, None, None]:
+        """As the contract; `start` in bytes."""
+        self._file = file = self._opened()
+        try:
+            lines = self._begun(file, start)
+            while not stop.is_set():
+                chunk, arrived = file.read(CHUNK), time.monotonic()
+                replaced = not chunk and self.follow and self._replaced(file, lines.position)
+                if chunk or replaced or not self.follow:
+                    yield Batch(lines.rows(chunk), lines.position, arrived)
+                else:
+                    yield Batch([], lines.position)
+                    time.sleep(POLL_S)
+                if replaced:
+                    file.close()
+                    self._file = file = self._opened()
+                    self.parser.header = None
+                    lines = _Lines(self.parser)
+                elif not chunk and not self.follow:
+                    return
+        finally:
+            file.close()
+            self._file = None
+
+    def _begun(self, file: BinaryIO, start: int | None) -> _Lines:
+        """From `start` on; from the beginning where the file has become shorter."""
+        if start is not None and start <= os.fstat(file.fileno()).st_size:
+            # a CSV's header, or what shows that it is JSON, is of every run
+            before = self.parser.counts.to_dict()
+            while self.parser.header is None and file.tell() < start and (line := file.readline(LONGEST)):
+                self.parser.row(line)
+            self.parser.counts.load(before)
+            if file.tell() <= start:
+                file.seek(start)
+                return _Lines(self.parser, start)
+        self.parser.header = None
+        file.seek(0)
+        return _Lines(self.parser)
+
+    def _replaced(self, file: BinaryIO, position: int) -> bool:
+        """Whether the file was cut, or another has its name."""
+        try:
+            now = os.stat(self.path)
+        except OSError:
+            return False  # moved away, and its successor yet to come
+        mine = os.fstat(file.fileno())
+        return (now.st_ino, now.st_dev) != (mine.st_ino, mine.st_dev) or mine.st_size < position
+
+    def _opened(self) -> BinaryIO:
+        return opened(self.path, need="a file of rows, or - for standard input,")

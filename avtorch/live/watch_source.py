@@ -1,14 +1,12 @@
-"""The loop of a live watch: pull a batch, answer, write lines of JSON to sinks, keep the cars' states in a folder.
+"""The loop of a live watch: pull a batch, answer, write lines of JSON to sinks, keep the cars' state in a file.
 
-Each car has a file of its own: its belief with draws and random numbers, its open window, the rows kept back for
-re-ordering, and the position in the source up to which its rows are in it. Files are written one after the other
-between batches, so that no answer waits for all of them. A record beside them holds the position from which the source
-has to be read: rows that a car has taken in already are passed over. Each file appears whole or not at all.
+The state is that of all cars after a batch: their beliefs with draws and random numbers, their open windows, the rows
+kept back for re-ordering, and the position in the source up to which its rows are in it. It appears whole or not at
+all; the same windows as before a kill have the same numbers, by which a file of answers knows them.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import sys
@@ -21,112 +19,66 @@ from typing import IO, Any, Protocol
 
 from avtorch.errors import InputError
 from avtorch.inference.stream import packed, unpacked
-from avtorch.io import read_sealed, read_sealed_bytes, write_sealed
+from avtorch.io import read_sealed_bytes, write_sealed
 from avtorch.io.answers import json_text
 from avtorch.live.car import Answer, LiveCar, LiveWatch
 from avtorch.live.source import Source
 from avtorch.version import __version__
 
-CAR, RECORD = "avtorch.live_car/2", "avtorch.live_source/2"
-MOST = 2**28
-"""Bytes of a car's state at most; it takes some 0.1 MB."""
+STATE = "avtorch.live/1"
+MOST = 2**30
+"""Bytes of a state at most; it takes some 0.1 MB a car."""
 EVERY_S = 10.0
-"""Wall-clock time after which a car's new state is written [s]: what is computed again at most after a kill."""
+"""Wall-clock time after which the state is written anew [s]: what is computed again at most after a kill."""
 REMEDY = "use the same settings, or another folder for --state"
 
 
 class KeptCars:
-    """The states in `folder`, of a watch of the source called `identity`.
+    """The state in `folder`, of a watch of the source called `identity`.
 
-    Raises `InputError` where the folder cannot be used.
+    Raises `InputError` where the folder cannot be used, and for a damaged state.
     """
 
     def __init__(self, folder: str | Path, identity: str | None = None) -> None:
-        self.folder, self.identity = Path(folder), identity
-        self._record_path = self.folder / "source.json"
-        there = self._record_path.exists()
-        self._found = read_sealed(self._record_path, schema=RECORD, remedy=REMEDY) if there else None
-        self._written: dict[str, tuple[float, int | None]] = {}  # by car: when, and the position that its file holds
-        self._begun: int | None = None
-        self._recorded = time.monotonic()
-        self._next = 0.0
-
-    @property
-    def same_source(self) -> bool:
-        """Whether the folder holds states of this very source, which can be read on from where they end."""
-        found = self._found
-        return found is not None and self.identity is not None and found.content["source"] == self.identity
+        self.folder, self.path = Path(folder), Path(folder) / "watch.state"
+        self._of: dict[str, Any] = {}
+        self._found: dict[str, Any] | None = None
+        if self.path.exists():
+            self._of, content = read_sealed_bytes(self.path, schema=STATE, most=MOST, remedy=REMEDY)
+            self._found = unpacked(content, self.path, REMEDY)
+        self.same_source = self._found is not None and identity is not None and self._found["source"] == identity
+        """Whether the state is of this very source, which can be read on from where it ends."""
+        self._due = 0.0
 
     def restore(self, watch: LiveWatch) -> int | None:
-        """Bring `watch` to the state in the folder, and name the source there; returns the position to read it from,
-        None for its start.
+        """Bring `watch` to the state in the folder; returns the position to read the source from, None for its start.
 
-        Raises `InputError` for states of other settings, and for damaged ones.
+        Raises `InputError` for a state of other settings.
         """
         if self._found is None:
-            # so that a run killed before its first state is known to be of it, too
-            self._record(watch, None)
             return None
-        self._same(self._found.of, watch, self._record_path)
-        watch.counts.load(self._found.content["counts"])
-        same = self.same_source
-        for path in sorted(self.folder.glob("*.car")):
-            sealed = read_sealed_bytes(path, schema=CAR, most=MOST, remedy=REMEDY)
-            self._same(sealed.of, watch, path)
-            try:
-                car = LiveCar.restored(unpacked(sealed.content, path, REMEDY), watch.settings, watch.counts)
-            except InputError as fault:
-                raise InputError(f"{path}: {fault}; {REMEDY}") from None
-            car.position = car.position if same else None
-            watch.cars[car.name] = car
-            self._written[car.name] = time.monotonic(), car.position
-        self._begun = self._found.content["position"] if same else None
-        return self._begun
-
-    def begin_anew(self, watch: LiveWatch, identity: str | None) -> None:
-        """Positions count from 0 again, in a source of another identity; all states are written."""
-        self.identity, self._begun = identity, None
-        self.write(watch)
-
-    def keep(self, watch: LiveWatch, position: int | None) -> None:
-        """Write the state of one car whose turn it is, if any, and the record now and then."""
-        now = time.monotonic()
-        if now < self._next:
-            return
-        self._next = now + EVERY_S / max(200, 2 * len(watch.cars))  # so that each has its turn
-        for name in watch.cars:
-            self._written.setdefault(name, (now, self._begun))
-        due = min(self._written, key=lambda name: self._written[name][0], default=None)
-        if due is not None and now - self._written[due][0] >= EVERY_S:
-            self._write_car(watch, watch.cars[due])
-        if now - self._recorded >= EVERY_S:
-            self._recorded = now
-            behind = [at for name, (_, at) in self._written.items() if watch.cars[name].position != at]
-            known = [at for at in behind if at is not None]
-            self._record(watch, position if not behind else min(known) if len(known) == len(behind) else self._begun)
-
-    def write(self, watch: LiveWatch, position: int | None = None) -> None:
-        """Write all states and the record, at the end."""
-        for car in watch.cars.values():
-            self._write_car(watch, car)
-        self._record(watch, position)
-
-    def _write_car(self, watch: LiveWatch, car: LiveCar) -> None:
-        name = hashlib.sha256(car.name.encode("utf-8", "surrogatepass")).hexdigest()[:24]
-        path = self.folder / f"{name}.car"
-        write_sealed(path, packed(car.state_dict()), schema=CAR, of=_work(watch))
-        self._written[car.name] = time.monotonic(), car.position
-
-    def _record(self, watch: LiveWatch, position: int | None) -> None:
-        content = {"source": self.identity, "position": position, "counts": watch.counts.to_dict()}
-        write_sealed(self._record_path, content, schema=RECORD, of=_work(watch))
-
-    @staticmethod
-    def _same(of: dict[str, Any], watch: LiveWatch, path: Path) -> None:
-        """Raises `InputError` that names the setting in which a state differs from the watch."""
         for name, value in _work(watch).items():
-            if of.get(name) != value:
-                raise InputError(f"{path}: was begun with {name} {str(of.get(name))[:40]}, not {value}; {REMEDY}")
+            if self._of.get(name) != value:
+                found = str(self._of.get(name))[:40]
+                raise InputError(f"{self.path}: was begun with {name} {found}, not {value}; {REMEDY}")
+        watch.counts.load(self._found["counts"])
+        for state in self._found["cars"]:
+            car = LiveCar.restored(state, watch.settings, watch.counts)
+            watch.cars[car.name] = car
+        return self._found["position"] if self.same_source else None
+
+    def keep(self, watch: LiveWatch, position: int | None, identity: str | None) -> None:
+        """Write the state now and then, of a source that was read up to `position`; at once where there is none, so
+        that a run killed before its first window is known to be of it, too."""
+        if time.monotonic() >= self._due:
+            self.write(watch, position, identity)
+
+    def write(self, watch: LiveWatch, position: int | None, identity: str | None) -> None:
+        """Write the state."""
+        cars = [car.state_dict() for car in watch.cars.values()]
+        state = {"source": identity, "position": position, "counts": watch.counts.to_dict(), "cars": cars}
+        write_sealed(self.path, packed(state), schema=STATE, of=_work(watch))
+        self._due = time.monotonic() + EVERY_S
 
 
 def _work(watch: LiveWatch) -> dict[str, str]:
@@ -247,7 +199,7 @@ def watch_source(
     Raises `InputError` for a state that does not fit, and for what source and sinks raise.
     """
     stop = Event() if stop is None else stop
-    position = None if kept is None else kept.restore(watch)
+    position, identity = None if kept is None else kept.restore(watch), source.identity
 
     def tell(answers: Sequence[Answer]) -> None:
         for answer in answers:
@@ -264,17 +216,17 @@ def watch_source(
     whole = True  # no batch is half taken in
     try:
         with closing(source.batches(stop, position)) as batches:
+            if kept is not None:
+                kept.keep(watch, position, identity)
             for batch in batches:
-                if batch.anew and kept is not None:
-                    kept.begin_anew(watch, source.identity)
-                position, whole = batch.position, False
+                whole = False
                 tell(watch.take(batch))
-                whole = True
+                position, identity, whole = batch.position, source.identity, True
                 if kept is not None:
-                    kept.keep(watch, position)
+                    kept.keep(watch, position, identity)
         if kept is None and not stop.is_set():
             tell(watch.flush(time.monotonic()))
     finally:
-        # after an error in the middle of a batch the states on disk are the ones to go on from
+        # after an error in the middle of a batch the state on disk is the one to go on from
         if kept is not None and whole:
-            kept.write(watch, position)
+            kept.write(watch, position, identity)

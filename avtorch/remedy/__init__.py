@@ -1,9 +1,6 @@
 """What to do about a gap once its cause is known: the setting that the car needs, and its plant in other tools'
 terms."""
 
-from avtorch.remedy.exports import CarlaPedals as CarlaPedals
-from avtorch.remedy.exports import Exported as Exported
-from avtorch.remedy.exports import SumoType as SumoType
 from avtorch.remedy.exports import to_autoware, to_carla, to_openpilot, to_sumo, write_exports
 from avtorch.remedy.trial import Trial
 from avtorch.remedy.what_to_set import WhatToSet, setting_for, what_to_set

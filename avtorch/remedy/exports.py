@@ -21,13 +21,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 from xml.etree import ElementTree
 
 import torch
 
+from avtorch.arrays import FloatArray
 from avtorch.gap import FREE_FORMS, ForceTable, GapPlant, ResistanceCurve
 from avtorch.io import answer_set, atomic
 from avtorch.pedals import MapTable, PedalMap, accel_table, brake_table
@@ -36,17 +37,27 @@ from avtorch.pedals import MapTable, PedalMap, accel_table, brake_table
 @dataclass(frozen=True)
 class Exported:
     """`values` by the tool's own names; `lost`: properties of the plant that the tool cannot express, one sentence
-    each.
+    each; `tables` of the acceleration by the name of a pedal.
     """
 
     tool: str
     values: Mapping[str, float]
     lost: tuple[str, ...]
+    tables: Mapping[str, MapTable] = field(default_factory=dict)
 
     def to_text(self) -> str:
-        """YAML lines, with the lost properties as comments."""
+        """YAML lines, with the lost properties as comments; for each pedal the acceleration [m/s²] by pedal (a line
+        each) and speed [m/s], coasting included."""
         lines = [f"# {self.tool}", *(f"# not expressed: {text}" for text in self.lost)]
-        return "\n".join([*lines, *(f"{name}: {value:.6g}" for name, value in self.values.items())]) + "\n"
+        lines += [f"{name}: {value:.6g}" for name, value in self.values.items()]
+        for name, table in self.tables.items():
+            lines += [f"{name}:", f"  speed: {_numbers(table.speed)}"]
+            lines += [f"  {pedal:.6g}: {_numbers(row)}" for pedal, row in zip(table.pedal, table.accel, strict=True)]
+        return "\n".join(lines) + "\n"
+
+
+def _numbers(values: FloatArray) -> str:
+    return "[" + ", ".join(f"{x:.4g}" for x in values) + "]"
 
 
 def _delay(plant: GapPlant) -> float:
@@ -123,23 +134,7 @@ _NO_LAG = "VehicleControl has neither; what the model has comes from its physics
 _PHYSICS = "mass, drag_coefficient and torque_curve of VehiclePhysicsControl: a log of pedals does not tell them apart"
 
 
-@dataclass(frozen=True)
-class CarlaPedals(Exported):
-    """`tables` by the name of a pedal in `VehicleControl`."""
-
-    tables: Mapping[str, MapTable]
-
-    def to_text(self) -> str:
-        """YAML: for each pedal the acceleration [m/s²] by pedal (a line each) and speed [m/s], coasting included."""
-        lines = []
-        for name, table in self.tables.items():
-            lines += [f"{name}:", f"  speed: {_numbers(table.speed.tolist())}"]
-            rows = zip(table.pedal.tolist(), table.accel.tolist(), strict=True)
-            lines += [f"  {pedal:.6g}: {_numbers(accels)}" for pedal, accels in rows]
-        return super().to_text() + "\n".join(lines) + "\n"
-
-
-def to_carla(pedals: PedalMap, plant: GapPlant | None = None) -> CarlaPedals:
+def to_carla(pedals: PedalMap, plant: GapPlant | None = None) -> Exported:
     """The map `pedals` for throttle and brake; of the `plant`, if one was found behind them, only what is lost."""
     given = {"throttle": accel_table(pedals), "brake": brake_table(pedals)}
     tables = {name: table for name, table in given.items() if table is not None}
@@ -150,11 +145,7 @@ def to_carla(pedals: PedalMap, plant: GapPlant | None = None) -> CarlaPedals:
     lost.append(f"physics: {_PHYSICS}")
     if plant is not None:
         lost += _lost(plant, gain="the tables hold K_L 1; multiply the accelerations")
-    return CarlaPedals("CARLA VehicleControl", {}, tuple(lost), tables)
-
-
-def _numbers(values: list[float]) -> str:
-    return "[" + ", ".join(f"{x:.4g}" for x in values) + "]"
+    return Exported("CARLA VehicleControl", {}, tuple(lost), tables)
 
 
 ACCELERATION_MAP = "plant.autoware.csv"

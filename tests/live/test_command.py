@@ -93,7 +93,7 @@ def test_a_followed_file_stopped_in_its_midst_and_gone_on_with(here: Path, numbe
     if number != signal.SIGKILL:
         assert first.returncode == 0, err
         assert b"state kept in state" in err
-        assert (here / "state" / "source.json").exists()
+        assert (here / "state" / "watch.state").exists()
     with (here / "live.jsonl").open("ab") as stream:
         stream.write(text[half:])
     second = started(here, *arguments)
@@ -151,8 +151,7 @@ def test_metrics_are_served_while_it_runs(here: Path, capsys: pytest.CaptureFixt
 
     counts = Counts()
     watch, parser = LiveWatch(counts=counts), LineParser(counts)
-    metrics = Metrics(watch)
-    port = metrics.start("127.0.0.1", 0)
+    metrics = Metrics(watch, "127.0.0.1", 0)
     pages = []
 
     class Lines:
@@ -162,7 +161,7 @@ def test_metrics_are_served_while_it_runs(here: Path, capsys: pytest.CaptureFixt
             for line in [*lines(fleet(4.2)).splitlines(), b"{"]:
                 row = parser.row(line)
                 yield Batch([] if row is None else [row])
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as page:
+            with urllib.request.urlopen(f"http://127.0.0.1:{metrics.port}/metrics", timeout=10) as page:
                 pages.append(page.read().decode())
 
     try:

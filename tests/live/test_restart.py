@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 import sys
 from pathlib import Path
 from threading import Event
@@ -30,7 +29,7 @@ CHUNK = 997  # bytes, so that batches end in the middle of rows and windows
 
 @pytest.fixture(autouse=True)
 def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avtorch.live.line_source.CHUNK", CHUNK)
+    monkeypatch.setattr("avtorch.live.source.CHUNK", CHUNK)
 
 
 def begin(folder: Path, settings: LiveSettings, *, follow: bool = False) -> tuple[LiveWatch, FileSource, KeptCars]:
@@ -92,9 +91,9 @@ def test_stopped_again_and_again_it_writes_what_an_uncut_one_writes(tmp_path: Pa
 
 
 def test_killed_it_writes_each_window_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """States are written at any time before a crash; here after every batch, of the car whose turn it is."""
+    """The state is written at any time before a crash; here after every batch."""
     monkeypatch.setattr(sys.modules["avtorch.live.watch_source"], "EVERY_S", 0.0)  # the function has its name
-    monkeypatch.setattr("avtorch.live.line_source.CHUNK", 10 * CHUNK)  # a batch costs two files
+    monkeypatch.setattr("avtorch.live.source.CHUNK", 10 * CHUNK)  # a batch costs two files
     (tmp_path / "rows.jsonl").write_bytes(lines(fleet(12.0)))
     out = tmp_path / "out.jsonl"
     repeated = 0
@@ -176,17 +175,15 @@ def test_states_of_other_settings_and_damaged_ones_are_refused(tmp_path: Path) -
     (tmp_path / "rows.jsonl").write_bytes(lines(fleet(4.0)))
     watch, source, kept = begin(tmp_path, SETTINGS["map"])
     watch_source(source, watch, [], kept=kept)
-    shutil.copytree(tmp_path / "state", tmp_path / "whole")
     watch, source, kept = begin(tmp_path, LiveSettings(window=3.0))
-    with pytest.raises(InputError, match=r"source.json: was begun with window 2.0, not 3.0; use the same"):
+    with pytest.raises(InputError, match=r"watch.state: was begun with window 2.0, not 3.0; use the same"):
         kept.restore(watch)
-    car = next(iter((tmp_path / "state").glob("*.car")))
-    content = bytearray(car.read_bytes())
+    path = tmp_path / "state" / "watch.state"
+    content = bytearray(path.read_bytes())
     content[-100] ^= 1
-    car.write_bytes(content)
-    watch, source, kept = begin(tmp_path, SETTINGS["map"])
-    with pytest.raises(InputError, match=rf"{car.name}: is damaged"):
-        kept.restore(watch)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"watch\.state: is damaged"):
+        begin(tmp_path, SETTINGS["map"])
 
 
 def test_a_file_of_something_else_is_not_written_to(tmp_path: Path) -> None:
