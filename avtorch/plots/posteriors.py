@@ -24,8 +24,9 @@ from torch import Tensor
 
 from avtorch.arrays import FloatArray
 from avtorch.inference import Posterior, Quadrature
+from avtorch.inference.arviz_export import arviz
 from avtorch.plots.style import BLACK, BLUE, LABELS, NARROW, VERMILLION, legend, short, styled
-from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE, arviz, sampling_diagnostics
+from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE, sampling_diagnostics
 from avtorch.validation.validate import Validation
 
 EXACT, EXACT_FILL = "#555555", "#DADADA"
