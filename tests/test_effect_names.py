@@ -1,4 +1,4 @@
-"""All knowledge of an effect is in its own class: no file of another package names one, by string or by import."""
+"""All knowledge of an effect is in its own file: no other file of the package names one, by string or by import."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ HOME = PACKAGE / "gap" / "effects"
 ALLOWED = {
     "app/workplace.py": "the car of the simulated example has two of them",
     "external/surrogate.py": "a second pole or a limit of the rate begins from a shorter lag",
-    "gap/engine": "one compiled loop for all effects: held to the effects row by row in test_compiled_plant.py",
+    "gap/engine": "one compiled loop for all effects: held to their own files row by row in test_compiled_plant.py",
     "gap/result": "what chance decides, and the delay beside T_L, have places of their own in an answer",
     "gap/diagnose.py": "lost messages are of the link, not of the car",
     "experiment/prediction.py": "what is unknown along a road is integrated out",
-    "remedy/linearised.py": "a road is no part of a loop",
+    "remedy/what_to_set.py": "a road is no part of a loop",
     "gap/__init__.py": "offers the classes to the user by name",
     "cli/estimate.py": "the dead time is an argument of the estimators, no effect",
     "cli/stability.py": "the dead time is an argument of the stability functions, no effect",

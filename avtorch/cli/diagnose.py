@@ -351,7 +351,7 @@ def chosen_effects(text: str | None) -> list[str] | None:
 
 
 def _prior(given: Sequence[str]) -> dict[str, float]:
-    from avtorch.gap import effect_class
+    from avtorch.gap.simulator.effect import effect_class
 
     weights: dict[str, float] = {}
     for item in given:

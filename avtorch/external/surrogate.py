@@ -27,12 +27,11 @@ from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.external.driving import driven_along
 from avtorch.external.simulator import Simulator, check_methods
-from avtorch.gap.engine.car import plant_of
 from avtorch.gap.engine.coordinates import EFFECTS as ATOMS
 from avtorch.gap.engine.coordinates import EngineEffect, adopt
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import fit, jacobian, objective, prior_terms, whitened_jacobian
-from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.hypothesis import Hypothesis, plant_of
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import CLAIM_HZ
 from avtorch.gap.engine.search import other_limit, promises

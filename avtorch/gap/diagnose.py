@@ -13,11 +13,11 @@ import numpy as np
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.gap.engine.average import ModelAverage, Weight
-from avtorch.gap.engine.car import plant_of
 from avtorch.gap.engine.coordinates import EFFECTS, adopt, base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.evidence import evaluate_evidence
 from avtorch.gap.engine.gauss_newton import fit
+from avtorch.gap.engine.hypothesis import plant_of
 from avtorch.gap.engine.inference import RANDOM, Inference, infer
 from avtorch.gap.engine.priors import UNKNOWN_NATS
 from avtorch.gap.engine.sample import sample

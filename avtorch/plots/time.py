@@ -124,7 +124,16 @@ def events(
     alerts: Iterable[Mapping[str, Any]] = (),
     actions: Iterable[Mapping[str, Any]] = (),
 ) -> Axes:
-    """Mark the change of the vehicle, the alerts and the actions on a time axis."""
+    """Mark the change of the vehicle, the alerts and the actions on a time axis.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.plots import events
+        >>> alert = {"time_s": 28.0, "detector": "stability", "why": "P(string stable) is 0.02"}
+        >>> ax = events(Figure().subplots(), change_s=26.0, alerts=[alert])
+        >>> len(ax.lines)
+        2
+    """
     # an action follows its alert at once: its line is broad and pale so that the thin alert on top stays visible
     for i, time in enumerate(sorted({a["time_s"] for a in alerts})):
         ax.axvline(time, color=ORANGE, alpha=0.45, linewidth=5, zorder=1.7, label=None if i else "alert")

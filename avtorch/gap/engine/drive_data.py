@@ -9,10 +9,11 @@ Channels are the acceleration [m/s²] and the differenced speed [m/s²]; both ke
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numba import njit
@@ -23,7 +24,7 @@ from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.drive_record import same_kind
 from avtorch.gap.engine.compiled_plant import GRID_S
-from avtorch.gap.engine.priors import BAND_RATIO, CLAIM_HZ, FRAME_S, WARM_S
+from avtorch.gap.engine.priors import BAND_RATIO, CLAIM_HZ, FRAME_S, SLOW_HZ, WARM_S
 from avtorch.io import Log
 from avtorch.io.log import AccelKind
 
@@ -48,6 +49,25 @@ class Grid:
     speed: FloatArray = field(repr=False)
     starts: BoolArray = field(repr=False)
     accel0: FloatArray = field(repr=False)
+
+
+class BandResponse(NamedTuple):
+    """What the transform makes of tones: `energy` (band, tone) [Hz] times a one-sided spectrum (tone,) is the mean
+    square of a coefficient in each band below `SLOW_HZ`. `frequency` (tone,) [Hz]; integration is included."""
+
+    frequency: FloatArray
+    energy: FloatArray
+
+
+def _tones(bin_hz: float) -> FloatArray:
+    """Tones (tone,) [Hz] on which spectra are integrated, of bins so far apart.
+
+    Even steps of 0.4 bins, as a bin's response has no structure finer than half of one; below, the spectra's own
+    resolution, one in twelve.
+    """
+    step = 0.4 * bin_hz
+    slow = np.exp(np.arange(math.log(5e-4), math.log(12 * step), math.log(13 / 12)))
+    return np.concatenate([[0.0], slow, np.arange(slow[-1] + step, 1.5 * SLOW_HZ, step)])
 
 
 def one_pole(time_constant: float, step: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -356,6 +376,28 @@ class DriveData:
         return lost, self.dt * np.arange(1.0, lost.max() + 2)
 
     # inside ----------------------------------------------------------------------------------------------------------
+    @cached_property
+    def band_response(self) -> BandResponse:
+        """The response of bands below `SLOW_HZ` to tones of any phase.
+
+        A coefficient is sum_n h_n x_n; of a stationary x its mean square is int S(f) |H(f)|² df, H the Fourier
+        transform of its row h of the transform. Its real and imaginary parts are the coefficients of a cosine and a
+        sine.
+        """
+        edges = self.band_edges
+        bands = min(int(np.searchsorted(self.frequency[edges[:-1]], SLOW_HZ)), self.band_count)
+        M = self.frame_rows
+        h = M // 2
+        tones = _tones(float(self.frequency[1] - self.frequency[0]))
+        phase = 2 * np.pi * tones[:, None] * np.arange(2 * M) * self.dt
+        w = np.concatenate([np.cos(phase), np.sin(phase)]) * self.window
+        folded = np.concatenate([-w[:, M + h - 1 : M - 1 : -1] - w[:, M + h :], w[:, :h] - w[:, M - 1 : h - 1 : -1]], 1)
+        squares = np.asarray(dct(folded, type=4, norm="ortho", axis=1))[:, : edges[bands]] ** 2
+        each = squares[: len(tones)] + squares[len(tones) :]
+        energy = np.add.reduceat(each, edges[:bands], axis=1) / np.diff(edges[: bands + 1])
+        steps = np.diff(tones, prepend=tones[0], append=tones[-1])
+        return BandResponse(tones, energy.T * 0.5 * (steps[1:] + steps[:-1]))
+
     def _measured(self) -> FloatArray:
         return self.transform(self.channel_rows(self.accel, self.speed))
 

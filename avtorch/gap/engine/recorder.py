@@ -11,11 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.engine.car import compiled, neutral_of
 from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import fit, objective, penalty
-from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.hypothesis import Hypothesis, compiled, neutral_of
 from avtorch.gap.engine.likelihood import claimed, log_likelihood
 from avtorch.gap.simulator.plant import GapPlant
 

@@ -23,14 +23,13 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, EngineEffect, base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.evidence import evaluate_evidence
-from avtorch.gap.engine.force_map import MAP_SIZES, MapForm, map_forms, size_log_prior
-from avtorch.gap.engine.free_forms import band_products, block, linear_evidence, map_free_form
+from avtorch.gap.engine.force_base import prices, resized, with_force_map
 from avtorch.gap.engine.gauss_newton import fit, linearised, normal_prior, objective, whitened_jacobian
 from avtorch.gap.engine.gear_shifts import refined_shift_speeds, shift_speeds, upshift_rows
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import log_likelihood, log_sum, whiten
+from avtorch.gap.engine.likelihood import log_likelihood, whiten
 from avtorch.gap.engine.lost_messages import with_lost_messages
-from avtorch.gap.engine.priors import UNKNOWN_NATS, WITHIN_NATS
+from avtorch.gap.engine.priors import WITHIN_NATS
 from avtorch.gap.engine.recorder import traded
 
 _MOST_FITS, _FEWEST_FITS = 160, 40  # of a search; a hard case of five minutes takes about fifty
@@ -38,8 +37,6 @@ _GRID_FITS = 4e6  # fits times grid points: what a long drive may cost
 _WIDTH, _LATER_WIDTH, _SECOND_WIDTH = 9, 6, 4  # effects fitted from the base, from a set, on a second way in
 _FINISHED = 3  # of these, how many are finished
 _RAMPS = 10  # of a gain that changes, from a second to the drive's length
-_SIZE_ROUNDS = 3  # of fits, each with the likeliest size of the map
-_MAP_LAGS_S = (None, 0.3)  # from which a fit with a map begins: the base's own lag was fitted to a wrong force
 _MARGIN_S = 8.0  # no onset this near to an end of the drive
 _LEAST_PROMISE = 1.5  # nats: less is the gain of a parameter that does nothing
 _SLOPES = {
@@ -558,77 +555,3 @@ def refined_onset(h: Hypothesis, effect: str) -> Hypothesis:
             if best is before:
                 break
     return best if best is h else fit(best, 5)
-
-
-# bases with a force map ----------------------------------------------------------------------------------------------
-class Price(NamedTuple):
-    """What a form would gain beside a hypothesis [nats], its presence paid for, and its likeliest prior size [-]."""
-
-    form: MapForm
-    nats: float
-
-    @property
-    def gains(self) -> bool:
-        """Whether the drive speaks for it at all: the odds against any map are left out."""
-        return self.nats > -UNKNOWN_NATS
-
-
-def prices(h: Hypothesis) -> list[Price]:
-    """Gains of the forms of a map beside a hypothesis with its evidence, by one linear step; none where it has one."""
-    if h.force is not None:
-        return []
-    out = []
-    for form in map_forms(h.data):
-        found = block(h, map_free_form(h, form))
-        out.append(Price(form.of_size(found.size), found.nats - UNKNOWN_NATS))
-    return out
-
-
-def with_force_map(base: Hypothesis, form: MapForm) -> Hypothesis:
-    """A base with a force map, fitted and valued; gains count over `base`, which has none."""
-    best = None
-    for lag in _MAP_LAGS_S:
-        h = base.copy()
-        h.plain, h.force, h.force_coefficients = base, form, np.zeros(form.count)
-        if lag is not None:
-            h["T_L"] = lag
-        fit(h, 10)
-        if best is None or objective(h) > objective(best):
-            best = h
-    assert best is not None
-    for _ in range(_SIZE_ROUNDS):
-        before = best.force
-        best = resized(best)
-        if before is not None and best.force is not None and before.size == best.force.size:
-            break
-    best.base = best
-    return evaluate_evidence(best)
-
-
-def resized(h: Hypothesis) -> Hypothesis:
-    """The fitted hypothesis with the likeliest prior size of its map, changed in place: effects that do what the map
-    did leave a smaller one. One without a map stays as it is."""
-    if h.force is None:
-        return h
-    for _ in range(2):
-        nats, size = _of_sizes(h), h.force.size
-        k = int(np.argmax(nats))
-        h.force = h.force.of_size(float(MAP_SIZES[k]), log_sum(nats) - float(nats[k]))
-        if h.force.size == size:
-            break
-        fit(h, 5, 0.1)
-    return h
-
-
-def _of_sizes(h: Hypothesis) -> FloatArray:
-    """Log evidence and log prior (size,) [nats] of each of `MAP_SIZES`, of a map linear around where it is."""
-    assert h.force is not None
-    slopes, precision, pull = linearised(h, h.free)
-    products = band_products(h.data, np.concatenate([h.residual[None], slopes]))
-    b, n = h.force_coefficients, len(h.free)
-    nats = []
-    for size in MAP_SIZES:
-        precision[n:], pull[n:] = size**-2, -b / size**2
-        value, _ = linear_evidence(h, products, precision, pull, 8, integrated=True)
-        nats.append(value - 0.5 * float(b @ b) / size**2 - len(b) * np.log(size))
-    return np.array(nats) + size_log_prior()

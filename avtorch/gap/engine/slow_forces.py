@@ -30,18 +30,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numba import njit
-from scipy.fft import dct
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance
-from avtorch.gap.engine.priors import ONSET_ODDS, SLOW_HZ
+from avtorch.gap.engine.priors import ONSET_ODDS
 
 # priors: log-normal, by mean and standard deviation of the logarithm
 PROCESS_NOISE = (0.03, 0.8)
@@ -77,14 +75,6 @@ SENSOR_ALONE_HZ = 0.5
 
 _SENSOR_FLOOR = 1e-4  # least variance of a sensor, relative to the residual's: rounding, no sensor is as good
 _POWER_FLOOR = 1e-12  # (m/s²)²: keeps covariances regular where there is no force
-
-
-class BandResponse(NamedTuple):
-    """What the transform makes of tones: `energy` (band, tone) [Hz] times a one-sided spectrum (tone,) is the mean
-    square of a coefficient in each band below `SLOW_HZ`. `frequency` (tone,) [Hz]; integration is included."""
-
-    frequency: FloatArray
-    energy: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,33 +129,6 @@ def road_spectrum(frequency: FloatArray, corner: float | FloatArray) -> FloatArr
     end = np.asarray(corner, float)[..., None]
     width = math.pi / ROAD_STEEPNESS / math.sin(math.pi / ROAD_STEEPNESS)  # over which a flat spectrum has variance 1
     return 1 / (1 + (frequency / end) ** ROAD_STEEPNESS) / (width * end)
-
-
-_RESPONSES: WeakKeyDictionary[DriveData, BandResponse] = WeakKeyDictionary()
-
-
-def band_response(data: DriveData) -> BandResponse:
-    """The response of bands below `SLOW_HZ` to tones of any phase; computed once.
-
-    A coefficient is sum_n h_n x_n; of a stationary x its mean square is int S(f) |H(f)|² df, H the Fourier transform of
-    its row h of the transform. Its real and imaginary parts are the coefficients of a cosine and a sine.
-    """
-    if data in _RESPONSES:
-        return _RESPONSES[data]
-    edges = data.band_edges
-    bands = min(int(np.searchsorted(data.frequency[edges[:-1]], SLOW_HZ)), data.band_count)
-    M = data.frame_rows
-    h = M // 2
-    tones = _tones(float(data.frequency[1] - data.frequency[0]))
-    phase = 2 * np.pi * tones[:, None] * np.arange(2 * M) * data.dt
-    w = np.concatenate([np.cos(phase), np.sin(phase)]) * data.window
-    folded = np.concatenate([-w[:, M + h - 1 : M - 1 : -1] - w[:, M + h :], w[:, :h] - w[:, M - 1 : h - 1 : -1]], 1)
-    squares = np.asarray(dct(folded, type=4, norm="ortho", axis=1))[:, : edges[bands]] ** 2
-    each = squares[: len(tones)] + squares[len(tones) :]
-    energy = np.add.reduceat(each, edges[:bands], axis=1) / np.diff(edges[: bands + 1])
-    steps = np.diff(tones, prepend=tones[0], append=tones[-1])
-    _RESPONSES[data] = BandResponse(tones, energy.T * 0.5 * (steps[1:] + steps[:-1]))
-    return _RESPONSES[data]
 
 
 # likelihoods of a common power ----------------------------------------------------------------------------------------
@@ -292,7 +255,7 @@ def slow_forces(
     `given`: covariance (band, channel, channel) and counts (band,) in place of the residual's; bands beyond `SLOW_HZ`
     are ignored. `lags` (lag,) [s], see `pulling_lags`: the likeliest counts; T_L where not given.
     """
-    frequency, energy = band_response(data)
+    frequency, energy = data.band_response
     bands = len(energy)
     covariance, counts = (band_covariance(data, residual), data.band_size) if given is None else given
     sensor = _before_the_sensor(data, values, bands)
@@ -376,7 +339,7 @@ def slow_onset(
     frames = data.frame_count
     if frames < 10 or (kind == "road" and data.accel_kind == "specific-force"):
         return SlowOnset(0.0)
-    frequency, energy = band_response(data)
+    frequency, energy = data.band_response
     unit = found.process_power / found.process_noise_beside_gust**2
     process = PROCESS_NOISE_GRID[:, None] ** 2 * unit
     of_process = _log_normal(PROCESS_NOISE_GRID, PROCESS_NOISE)
@@ -457,17 +420,6 @@ def _before_the_sensor(data: DriveData, values: FloatArray, bands: int) -> Float
         scales[0] /= 1 + values[INDEX["sensor_scale"]]
         out = scales.T[:, :, None] * scales.T[:, None, :]
     return out
-
-
-def _tones(bin_hz: float) -> FloatArray:
-    """Tones (tone,) [Hz] on which spectra are integrated, of bins so far apart.
-
-    Even steps of 0.4 bins, as a bin's response has no structure finer than half of one; below, the spectra's own
-    resolution, one in twelve.
-    """
-    step = 0.4 * bin_hz
-    slow = np.exp(np.arange(math.log(5e-4), math.log(12 * step), math.log(13 / 12)))
-    return np.concatenate([[0.0], slow, np.arange(slow[-1] + step, 1.5 * SLOW_HZ, step)])
 
 
 def _log_normal(x: FloatArray, prior: tuple[float, float]) -> FloatArray:

@@ -26,11 +26,10 @@ from torch.autograd.function import once_differentiable
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.effects import DrivelineOscillation
-from avtorch.gap.engine.car import drives_of, plant_of, table_effect
 from avtorch.gap.engine.compiled_plant import _FREE_DAMPING
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, NEUTRAL, Coordinate, base_name
 from avtorch.gap.engine.drive_data import UNKNOWN_SPEED_MPS, DriveData, filtered
-from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.hypothesis import Hypothesis, drives_of, plant_of, table_effect
 from avtorch.gap.simulator.actuator import Actuator, Substep
 from avtorch.gap.simulator.chain import at_place, in_order, substeps
 from avtorch.gap.simulator.effect import Effect, EffectContext, context_at

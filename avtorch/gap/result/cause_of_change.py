@@ -10,21 +10,17 @@ import torch
 from scipy.stats import t as student
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.engine.car import table_effect
-from avtorch.gap.engine.coordinates import adopt
-from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.joint import (
-    Change,
+from avtorch.gap.engine.changes import (
     ChangePosterior,
-    JointFit,
-    JointModel,
     Progress,
     candidates,
     lag_or_dead_time,
-    of_car,
     scatter_of,
     search_changes,
 )
+from avtorch.gap.engine.coordinates import adopt
+from avtorch.gap.engine.hypothesis import Hypothesis, table_effect
+from avtorch.gap.engine.joint import Change, JointFit, JointModel, of_car
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.budget import LIKELY
 from avtorch.gap.result.comparison import Answer, ChangeCause, ChangePart, DeadTimeTest, detectable_text

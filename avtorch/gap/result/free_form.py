@@ -29,10 +29,9 @@ from scipy.linalg import block_diag
 from scipy.signal import lfilter
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
-from avtorch.gap.engine.car import plant_of
 from avtorch.gap.engine.force_map import ForceMap
 from avtorch.gap.engine.gauss_newton import fit
-from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.hypothesis import Hypothesis, plant_of
 from avtorch.gap.engine.priors import MAP_SIZE
 from avtorch.gap.engine.sample import sample
 from avtorch.gap.result.budget import HORIZON_S

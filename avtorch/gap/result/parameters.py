@@ -17,9 +17,8 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.effects import Gust, Outliers, RoadGrade
 from avtorch.gap.engine.average import ModelAverage, Weight
-from avtorch.gap.engine.car import effect_values, plant_of
 from avtorch.gap.engine.coordinates import EFFECTS, Coordinate, base_name
-from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.hypothesis import Hypothesis, effect_values, plant_of
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.sample import Draws, sample
 from avtorch.gap.quantity import Quantity

@@ -292,7 +292,7 @@ EFFECTS: dict[str, type[Effect]] = {}
 Example:
     >>> from avtorch.gap import EFFECTS
     >>> len(EFFECTS), [name for name, effect in EFFECTS.items() if effect.place == "sensor"]
-    (25, ['sensor_lag', 'speed_lag', 'sensor_scale', 'sensor_bias', 'outliers'])
+    (25, ['outliers', 'sensor_bias', 'sensor_lag', 'sensor_scale', 'speed_lag'])
 """
 
 E = TypeVar("E", bound=type[Effect])

@@ -11,7 +11,7 @@ import torch
 
 from avtorch import Log
 from avtorch.gap import AerodynamicDrag, DrivelineOscillation, Effect, SecondOrderActuator, plant
-from avtorch.gap.engine import car
+from avtorch.gap.engine import hypothesis
 from avtorch.gap.engine.coordinates import EFFECTS, FROM_THE_START, INDEX
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
@@ -70,7 +70,7 @@ def _by_the_simulator(h: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
         torch.as_tensor(grid.speed),
         float(grid.accel0[0]),
     )
-    response = car.plant_of(h).response(drive)
+    response = hypothesis.plant_of(h).response(drive)
     return response.accel_measured.numpy(), (response.speed_measured - response.speed_measured[0]).numpy()
 
 
@@ -113,7 +113,9 @@ def test_a_gain_that_has_always_been_changed_is_another_gain():
 )
 def test_a_users_baseline_has_all_its_settings(effect: Effect):
     simulator = plant([effect], T_L=0.37, K_L=0.93)
-    h = Hypothesis(_data(1), neutral=car.neutral_of(simulator), baseline=None if car.compiled(simulator) else simulator)
+    h = Hypothesis(
+        _data(1), neutral=hypothesis.neutral_of(simulator), baseline=None if car.compiled(simulator) else simulator
+    )
     h.values = h.neutral.copy()
     grid = h.data.grid
     drive = SimulatorInput(

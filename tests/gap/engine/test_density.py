@@ -11,11 +11,10 @@ import torch
 
 from avtorch import Log
 from avtorch.gap import DeadTime, Effect, Parameter, plant
-from avtorch.gap.engine.car import neutral_of
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, adopt
 from avtorch.gap.engine.density import HypothesisDensity
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.hypothesis import Hypothesis, neutral_of
 from avtorch.gap.engine.torch_plant import TorchPlant, not_in_torch
 from avtorch.inference.density import Density, ScoredDensity
 from tests.gap.engine.test_compiled_plant import VALUES

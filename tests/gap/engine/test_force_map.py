@@ -18,12 +18,13 @@ from avtorch.arrays import FloatArray
 from avtorch.gap import DeadTime, Effect
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.evidence import evaluate_evidence
+from avtorch.gap.engine.force_base import prices, with_force_map
 from avtorch.gap.engine.force_map import CURVES, MAP_SIZES, ForceMap, MapForm, map_forms, size_log_prior
 from avtorch.gap.engine.gauss_newton import force_columns, linearised
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.inference import Inference, infer
 from avtorch.gap.engine.recorder import base_fit
-from avtorch.gap.engine.search import prices, tried, with_force_map
+from avtorch.gap.engine.search import tried
 from avtorch.gap.result.hypotheses import map_size
 from avtorch.io import Log
 from tests.gap.cars import log_of

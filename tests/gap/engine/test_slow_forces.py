@@ -18,7 +18,6 @@ from avtorch.gap.engine.slow_forces import (
     GUST_TIME_GRID_S,
     PROCESS_NOISE_GRID,
     SIZE_GRID_MPS2,
-    band_response,
     gust_spectrum,
     process_spectrum,
     pulling_lags,
@@ -81,7 +80,7 @@ def test_a_second_pole_leaves_the_variance_of_white_jerk() -> None:
 
 def test_white_noise_has_one_level_in_all_bands() -> None:
     data = _data(120)
-    response = band_response(data)
+    response = data.band_response
     below = data.frequency[data.band_edges[1 : len(response.energy) + 1] - 1] < SLOW_HZ
     level = response.energy.sum(1) * 2 / RATE_HZ  # spectrum of white noise of variance 1
     # the transform is orthonormal; 0.5 %: the grid of tones where it changes its pace
@@ -91,7 +90,7 @@ def test_white_noise_has_one_level_in_all_bands() -> None:
 @pytest.mark.statistical
 def test_the_response_is_the_mean_square_of_coefficients(rotating_seed: int, draws_factor: int) -> None:
     rng, data = np.random.default_rng(rotating_seed), _data(300)
-    response = band_response(data)
+    response = data.band_response
     n, repeats = len(response.energy), 24 * draws_factor
     each = []
     for _ in range(repeats):
