@@ -113,9 +113,8 @@ def test_a_gain_that_has_always_been_changed_is_another_gain():
 )
 def test_a_users_baseline_has_all_its_settings(effect: Effect):
     simulator = plant([effect], T_L=0.37, K_L=0.93)
-    h = Hypothesis(
-        _data(1), neutral=hypothesis.neutral_of(simulator), baseline=None if car.compiled(simulator) else simulator
-    )
+    own = None if hypothesis.compiled(simulator) else simulator
+    h = Hypothesis(_data(1), neutral=hypothesis.neutral_of(simulator), baseline=own)
     h.values = h.neutral.copy()
     grid = h.data.grid
     drive = SimulatorInput(
