@@ -125,9 +125,12 @@ def search_changes(model: JointModel, changes: list[Change], progress: Progress 
     """The posterior over sets of `changes`."""
     now = Visited(model.start, 0.0)
     visited = {frozenset[Key](): now}
+    passed = {_key(now.fit)}
     siblings: dict[Key, tuple[str, ...]] = {}
     rejected = None
-    while sum(not c.shared for c in now.fit.changes) < MOST and len(now.fit.changes) < 2 * MOST:
+    for number in range(1, 2 * MOST + 1):
+        if sum(not c.shared for c in now.fit.changes) == MOST:
+            break
         fits = []
         names = now.fit.names
         wanted = _promising(model, now.fit, [c for c in changes if c.name not in names])
@@ -135,7 +138,7 @@ def search_changes(model: JointModel, changes: list[Change], progress: Progress 
         wanted += [of_growth(c, now.fit.x[now.fit.at(c)]) for c in shared]
         for done, change in enumerate(wanted):
             if progress is not None:
-                progress(f"change {len(names) + 1}: {change.name}", done, len(wanted))
+                progress(f"change {number}: {change.name}", done, len(wanted))
             fits.append(model.with_change(now.fit, change))
         if not fits:
             break
@@ -157,11 +160,15 @@ def search_changes(model: JointModel, changes: list[Change], progress: Progress 
             if now.fit.names.count(change.name) > 1:
                 continue  # it is larger on one side
             rest = model.without(now.fit, change)
-            other = Visited(rest, now.log_weight + scatter.temper * (rest.evidence - now.fit.evidence + EFFECT_NATS))
+            lost = scatter.temper * (rest.evidence - now.fit.evidence)
+            other = Visited(rest, now.log_weight + lost + TEMPER * EFFECT_NATS)
             if _key(rest) not in visited:
                 visited[_key(rest)] = other
             if other.log_weight > now.log_weight:
                 now = other
+        if _key(now.fit) in passed:
+            break  # tempers differ from step to step, so that a set may be left and entered again
+        passed.add(_key(now.fit))
     scatters = {c: scatter_of(model, now.fit, c) for c in now.fit.changes}
     return ChangePosterior(model, now, visited, scatters, siblings, rejected, _unknown(model, now.fit))
 
