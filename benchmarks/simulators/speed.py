@@ -2,7 +2,8 @@
 
 ``python -m benchmarks.simulators.speed --step-ms 1 --by fmu --minutes 5 [--adjust lag=0.05:1.0] [--keep FOLDER]``
 
-The simulator spends so long on each step, besides its own sums. What the command prints is passed on. The car's log is at 100 Hz and has a sensor bias more than the simulator.
+The simulator spends so long on each step, besides its own sums. What the command prints is passed on. The car's log is
+at 100 Hz and has a sensor bias more than the simulator.
 """
 
 from __future__ import annotations
