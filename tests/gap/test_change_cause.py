@@ -298,6 +298,21 @@ def test_a_dead_band_of_both_drives_is_no_change_of_it(seed: int, first: int, be
         assert size.q05 < after - before < size.q95
 
 
+@pytest.mark.slow
+def test_what_leaves_a_set_costs_what_it_did_to_enter() -> None:
+    """Priced by another measure the bias left again, and the search went in a circle."""
+    car, plan = draw_car(np.random.default_rng([12, 3])), DrivePlan("steps", 120.0, 50, 12006)
+    both = {"speed_dependent_gain": {"gain_slope": -0.3, "reference_speed_mps": 12.0}}
+    logs = []
+    for number, effects in enumerate((both, {**both, "sensor_bias": {"bias_mps2": 0.1}})):
+        one = replace(plan, seed=plan.seed + number)
+        run = simulate(car, one.pilot(), seconds=120.0, rate_hz=50, effects=effects, seed=one.seed)
+        logs.append(Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed))
+    cause = avtorch.compare(*logs).cause
+    assert cause is not None
+    assert cause.names == ("sensor_bias",)
+
+
 def test_a_limit_out_of_reach_is_not_reported() -> None:
     h = base_fit(DriveData.of(log_of([])))
     h.effects.append("saturation")
