@@ -49,6 +49,7 @@ def test_shewhart_is_exact_and_ewma_of_weight_one_is_shewhart():
     limit = chart_limit("shewhart", 370.0)
     assert math.erfc(limit / math.sqrt(2.0)) == pytest.approx(1.0 / 370.0, rel=1e-12)
     assert shewhart_arl(limit) == pytest.approx(370.0, rel=1e-12)
+    # by the quadrature of any weight, which is exact here but for the rounding of its sums
     assert ewma_arl(limit, 1.0) == pytest.approx(370.0, rel=1e-9)
     assert ewma_arl(limit, 0.999) == pytest.approx(370.0, rel=0.01)
 
