@@ -24,7 +24,15 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name
 from avtorch.gap.engine.family import family_of
-from avtorch.gap.engine.free_forms import FreeFormFit, block, families, mirror_columns, tone, wandering
+from avtorch.gap.engine.free_forms import (
+    FreeFormFit,
+    block,
+    block_or_late,
+    families,
+    mirror_columns,
+    sensor_form,
+    wandering,
+)
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import log_sum
 from avtorch.gap.engine.outliers import Outliers, sensor_outliers
@@ -41,7 +49,7 @@ from avtorch.gap.engine.priors import (
 )
 from avtorch.gap.engine.search import Search
 from avtorch.gap.engine.shape_error import relative_size, shape_likelihood, shape_log_odds, shape_log_prior
-from avtorch.gap.engine.slow_forces import SlowForces, SlowOnset, pulling_lags, slow_forces, slow_onset
+from avtorch.gap.engine.slow_forces import SlowForces, SlowOnset, cycle_response, pulling_lags, slow_forces, slow_onset
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
 _EXAMINED = 8  # hypotheses that are examined in full
@@ -116,6 +124,8 @@ class Weight:
     def process_noise(self) -> float:
         """White jerk behind the actuator [m/s³/√Hz]: what is left of it where there is a gust."""
         slow = self.composition.slow
+        if self.composition.form == "cycle":
+            return slow.process_noise_beside_cycle
         return slow.process_noise_beside_gust if self.slow == "gust" else slow.process_noise
 
 
@@ -164,7 +174,7 @@ def examine(h: Hypothesis, search: Search) -> Examined:
     mirror = 0.0
     if not h.alone:  # with one channel no free form can be told from the base's own dynamics and slow force
         first = slow_forces(data, h.residual, _from_the_start(h), lags=lags)
-        forms, mirror = _free_forms(h, search, first)
+        forms, mirror = _free_forms(h, search)
         late = {kind: slow_onset(data, h.residual, first, kind) for kind in ("gust", "road")}
         compositions += [
             _composed(h, name, found.nats, found.residual, exact, lags, least=-6.0)
@@ -172,6 +182,7 @@ def examine(h: Hypothesis, search: Search) -> Examined:
             if found.residual is not None
         ]
         compositions = [_set_in(c, late) for c in compositions if c is not None]
+        compositions.append(_cycle(h, compositions[0]))
     beside = {}
     for e in h.effects if len(h.effects) > 1 else []:
         rest = search.without(h, e)
@@ -185,8 +196,8 @@ def examine(h: Hypothesis, search: Search) -> Examined:
     return Examined(h, tuple(c for c in compositions if c is not None), outliers, beside, mirror)
 
 
-def _free_forms(h: Hypothesis, search: Search, slow: SlowForces) -> tuple[dict[str, FreeFormFit], float]:
-    """Each free form beside a hypothesis whose slow forces are `slow`, and the nats of the mirrored linear bank."""
+def _free_forms(h: Hypothesis, search: Search) -> tuple[dict[str, FreeFormFit], float]:
+    """Each free form beside a hypothesis, and the nats of the mirrored linear bank."""
     # where bases have a map, it is there that a map stands beside these effects
     others = {name: form for name, form in families(h).items() if name != "map" or not search.map_bases}
     forms = {name: block(h, form) for name, form in others.items()}
@@ -194,17 +205,16 @@ def _free_forms(h: Hypothesis, search: Search, slow: SlowForces) -> tuple[dict[s
     if forms["linear"].nats > 0 or _LINEAR & set(h.names):
         mirror = max(block(h, mirror_columns(h)).nats, 0.0)
         forms["linear"] = forms["linear"]._replace(nats=forms["linear"].nats - mirror)
-    forms |= wandering(h)
-    steady = tone(h, 0.1 if max(slow.gust, slow.road) < 30 else 0.4).fit
-    forms["tone"] = steady._replace(nats=steady.nats - 5)
-    return forms, mirror
+    return forms | wandering(h) | {"sensor": block_or_late(h, sensor_form(h))}, mirror
 
 
 def free_form_response(x: Examined, search: Search, form: str) -> FloatArray | None:
     """What a free form explains of the residual beside a hypothesis, with all parameters moved again: coefficients
     (channel, frame, bin); None where it tells nothing."""
     h = x.hypothesis
-    forms, _ = _free_forms(h, search, slow_forces(h.data, h.residual, _from_the_start(h), lags=pulling_lags(h)))
+    if form == "cycle":
+        return cycle_response(h.data, h.residual, x.compositions[0].slow)
+    forms, _ = _free_forms(h, search)
     left = forms[form].residual if form in forms else None
     return None if left is None else h.residual - left
 
@@ -297,18 +307,20 @@ def _composed(
     shape = h.shape if residual is h.residual else shape_likelihood(data, residual, h.effect_energy)
     logs = np.zeros(1) if shape is None else shape.nats + shape_log_prior(h.effects)
     over = nats + log_sum(logs) - log_sum(h.shape_log)
-    if form and (over < least or (form == "tone" and nats < 2)):
+    if form and over < least:
         return None
-    parts: dict[str, list[float]] = {name: [] for name in SLOW}
+    asked = not form and not h.alone
+    kinds = (*SLOW, "cycle") if asked else SLOW
+    parts: dict[str, list[float]] = {name: [] for name in kinds}
     best: tuple[float, SlowForces] | None = None
     for k, value in enumerate(logs):
         if value < logs.max() - 6:
             continue
         given = None if shape is None else (np.ascontiguousarray(shape.covariances[k]), shape.counts[k])
-        found = slow_forces(data, residual, _from_the_start(h), given=given, lags=lags)
+        found = slow_forces(data, residual, _from_the_start(h), given=given, lags=lags, cycle=asked)
         free = -0.5 * float((found.counts * (np.linalg.slogdet(found.covariance)[1] + data.channel_count)).sum())
         total = exact + nats + float(value) + found.log_likelihood - free
-        for name, more in zip(SLOW, (0.0, found.gust, found.road), strict=True):
+        for name, more in zip(kinds, (0.0, found.gust, found.road, found.cycle), strict=False):
             parts[name].append(total + more)
         if best is None or parts["gust"][-1] > best[0]:
             best = parts["gust"][-1], found
@@ -317,6 +329,16 @@ def _composed(
     if form and residual is not h.residual and h.effect_energy is not None:
         relative = relative_size(data, h.covariance, h.residual - residual, h.effect_energy)
     return Composition(form, over, relative, {k: log_sum(v) for k, v in parts.items()}, best[1])
+
+
+def _cycle(h: Hypothesis, plain: Composition) -> Composition:
+    """A force that swings at one frequency in the place of the slow forces of a `plain` composition, as a form."""
+    relative = 99.0
+    total = plain.total["cycle"] - (_FAINT_GUST / plain.slow.cycle_sd) ** 2
+    if h.effect_energy is not None:
+        done = cycle_response(h.data, h.residual, plain.slow)
+        relative = relative_size(h.data, h.covariance, done, h.effect_energy)
+    return Composition("cycle", total - plain.total["none"], relative, {"none": total}, plain.slow)
 
 
 def _set_in(c: Composition, late: Mapping[str, SlowOnset]) -> Composition:
@@ -361,10 +383,10 @@ def _weights(x: Examined, examined: list[Examined]) -> Iterator[Weight]:
             if names and h.force is None and c.nats > 0:
                 # or one cause without a name does it all, and the names are but terms of its description
                 labels.append((None, -UNKNOWN_NATS + (each - TRIED_NATS) * count))
-        total, kinds = dict(c.total), SLOW
+        total, kinds = dict(c.total), [slow for slow in SLOW if slow in c.total]
         if h.alone:  # some slow force is any drive's
             large = c.slow.gust_sd > _LARGE_OF_COMMAND * h["K_L"] * float(np.std(h.data.command))
-            kinds = ("gust",) if large and total["gust"] > total["none"] + SLOW_FORCE_NATS else ("none",)
+            kinds = ["gust"] if large and total["gust"] > total["none"] + SLOW_FORCE_NATS else ["none"]
             total["none"] = max(total["none"], total["gust"] - SLOW_FORCE_NATS)
         for slow, (number, (label, worth)) in itertools.product(kinds, enumerate(labels)):
             part = c.form if number == 0 or label is None else ""

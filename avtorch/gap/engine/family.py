@@ -19,8 +19,9 @@ FAMILIES = {
 FORMS = {
     "linear": ("dynamics", "other linear dynamics"),
     "sided": ("dynamics", "lags that depend on the sign of the command"),
-    "tone": ("dynamics", "a steady tone"),
+    "cycle": ("dynamics", "a force that swings at one frequency"),
     "map": ("force map", "a force map"),
+    "sensor": ("sensor", "other dynamics of a reading"),
     "gain": ("time", "a gain that wanders"),
     "delay": ("time", "a delay that wanders"),
 }

@@ -4,8 +4,8 @@ r"""What no named effect explains: free forms of a family, linear in their coeff
 
 R is the residual of a hypothesis in lapped coefficients, J its Jacobian, so that every named parameter may move again,
 and z_j the response of all channels to a demand of a form: other lags (dynamics), other lags by sign, curves over
-command and speed (force map), a sine (tone), a gain or a delay that wanders as an Ornstein-Uhlenbeck
-process over the frames. The noise's covariance stays free in every band, as in `likelihood`; coefficients are
+command and speed (force map), a gain or a delay that wanders as an Ornstein-Uhlenbeck process over the frames, other
+lags of one reading (sensor). The noise's covariance stays free in every band, as in `likelihood`; coefficients are
 integrated out by Laplace's approximation. A form's gain is the lesser of that below `claim_hz` and that of all bands,
 as everywhere: a closed loop's echoes cancel over the whole band only (Ljung 1999, section 13.4).
 
@@ -18,13 +18,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from scipy.linalg import cho_factor, cho_solve
-from scipy.ndimage import median_filter
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.gap.engine.coordinates import INDEX
@@ -33,9 +32,10 @@ from avtorch.gap.engine.force_map import MAP_SIZES, MapForm, map_forms, size_log
 from avtorch.gap.engine.gauss_newton import linear_priors
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import claimed, freedom, least_noise, log_likelihood, log_sum, whiten
+from avtorch.gap.engine.priors import ONSET_ODDS
 
 COEFFICIENT_SD = 0.35
-"""Prior sd of a form's coefficient [of the demand; a tone's: m/s^2]: a third of what the command asks for."""
+"""Prior sd of a form's coefficient [of the demand]: a third of what the command asks for."""
 LAG_RATIOS = (0.3, 1.0, 3.0, 10.0)
 """Lags of a linear bank over the car's own [-]: half a decade apart, and twice that at the slow end."""
 SHORTEST_LAG_S = 0.03
@@ -46,10 +46,8 @@ WANDER_RATIOS = (0.3, 1.0, 2.0)
 """Sizes over the typical one [-] that are tried: weaker ones are not seen, larger ones are no wandering any more."""
 WANDER_S = (12.0, 30.0, 80.0)
 """Correlation times [s] of what wanders: longer than a frame, shorter than a drive."""
-TONE_HZ = 3.0
-"""Tones are searched for below [Hz]: swinging loops and controllers, not the engine or the wheels."""
-TONE_BACKGROUND_HZ = 0.25
-"""Width [Hz] of the running median that is the noise around a line, at least 15 bins of the spectrum."""
+ONSET_SHARES = (0.2, 0.35, 0.5, 0.65, 0.8)
+"""Shares of a drive's frames from which on a form may act: a sixth of a drive off costs a third of its evidence."""
 _DELAY_STEP_S = 0.02  # of the finite difference in a delay: about the typical wandering
 _ROUNDS = 4  # of coefficients given the noise, noise given coefficients; the best is the answer
 _COURSES = 3  # of what wanders, each under the noise that the last one left
@@ -82,13 +80,6 @@ class FreeFormFit(NamedTuple):
     size: float = COEFFICIENT_SD
 
 
-class Tone(NamedTuple):
-    """A steady line: its fit and its frequency [Hz]."""
-
-    fit: FreeFormFit
-    frequency: float
-
-
 def families(h: Hypothesis) -> dict[str, FreeForm]:
     """The free forms of dynamics ("linear", "sided") and of the force ("map", where the speed is known and the base has
     no map of its own)."""
@@ -105,6 +96,16 @@ def families(h: Hypothesis) -> dict[str, FreeForm]:
     if h.force is None and (maps := map_forms(h.data)):
         forms["map"] = map_free_form(h, maps[-1])
     return forms
+
+
+def sensor_form(h: Hypothesis) -> FreeForm:
+    """Linear dynamics of each reading alone: a sensor that lags, leads, or rings."""
+    short, _, long, longest = _bank(h)
+    of_car = demand_response(h, np.tile(h["K_L"] * h.command(), (3, 1)), np.array([short, long, longest]))
+    each = np.zeros((h.data.channel_count, *of_car.shape))
+    for channel in range(h.data.channel_count):
+        each[channel, :, channel] = of_car[:, channel]
+    return FreeForm("sensor", each.reshape(-1, *of_car.shape[1:]))
 
 
 def map_free_form(h: Hypothesis, form: MapForm) -> FreeForm:
@@ -150,6 +151,16 @@ def block(h: Hypothesis, form: FreeForm) -> FreeFormFit:
     return FreeFormFit(log_sum(nats) - over, residual, best[known:], size)
 
 
+def block_or_late(h: Hypothesis, form: FreeForm) -> FreeFormFit:
+    """Evidence of a linear form that acts throughout, or from one of `ONSET_SHARES` of the frames on."""
+    frames, fits = h.data.frame_count, [block(h, form)]
+    for share in ONSET_SHARES:
+        later = np.arange(frames)[:, None] >= share * frames
+        fit = block(h, replace(form, columns=form.columns * later))
+        fits.append(fit._replace(nats=fit.nats + math.log(ONSET_ODDS / len(ONSET_SHARES))))
+    return max(fits, key=lambda fit: fit.nats)
+
+
 def _bent(h: Hypothesis, moves: FloatArray, taken: FloatArray, linear: FloatArray) -> tuple[FloatArray, float]:
     """The residual without what a form has `taken`, simulated anew with the unknowns of `h` at their new values, and
     how many nats more the `linear` residual had promised: a large step in a lag is not linear."""
@@ -165,26 +176,6 @@ def wandering(h: Hypothesis) -> dict[str, FreeFormFit]:
     priors. Every grid point is as likely as any other, so the best of them costs the logarithm of their number.
     """
     return {kind: _wandering(h, response, WANDER_SD[kind]) for kind, response in _wandering_responses(h).items()}
-
-
-def tone(h: Hypothesis, fmin: float = 0.1) -> Tone:
-    """The steadiest line between `fmin` and `TONE_HZ` in what is left: a sine of every channel beside the hypothesis.
-
-    The line is found on the spectrum of the longest stretch, over a running median; its evidence is that of any other
-    form, less the logarithm of the number of frequencies that were looked at. A peak over its background is no
-    evidence: it grows with the length of the log.
-    """
-    data = h.data
-    frequency, tried = _strongest_line(h, fmin)
-    if not tried:
-        return Tone(FreeFormFit(0.0, None, np.zeros(2 * data.channel_count)), 0.0)
-    angle = 2.0 * math.pi * frequency * (data.time - data.time[0])
-    waves = data.transform([np.cos(angle), np.sin(angle)])
-    columns = np.zeros((data.channel_count, 2, data.channel_count, *waves.shape[1:]))
-    for c in range(data.channel_count):
-        columns[c, :, c] = waves
-    fit = block(h, FreeForm("tone", columns.reshape(-1, *columns.shape[2:])))
-    return Tone(fit._replace(nats=fit.nats - math.log(tried)), frequency)
 
 
 def demand_response(h: Hypothesis, demands: FloatArray, lags: FloatArray, *, backwards: bool = False) -> FloatArray:
@@ -406,40 +397,3 @@ def _best_course(score: FloatArray, information: FloatArray, priors: Sequence[Fl
             best = evidence
             course, cost = mean, -0.5 * float(mean @ (score - information @ mean)) - half_log_det
     return course, cost
-
-
-def _strongest_line(h: Hypothesis, fmin: float) -> tuple[float, int]:
-    """Frequency [Hz] of the spectral line that stands out most, and how many bins were looked at."""
-    data = h.data
-    longest = int(np.argmax(np.diff(data.bounds)))
-    rows = slice(data.bounds[longest] + data.warm_rows, data.bounds[longest + 1])
-    measured = data.channel_rows(data.accel, data.speed)
-    fmax = min(TONE_HZ, float(data.frequency[-1]))  # of the coefficients that count
-    best, line = -math.inf, (0.0, 0)
-    for y, x in zip(measured, h.rows(), strict=True):
-        error = (y - x)[rows]
-        frequency = np.fft.rfftfreq(len(error), data.dt)
-        step = float(frequency[1])
-        power = np.abs(np.fft.rfft((error - error.mean()) * np.hanning(len(error)))) ** 2
-        near = frequency < fmax + TONE_BACKGROUND_HZ
-        frequency, power = frequency[near], power[near]
-        looked = (frequency > fmin) & (frequency < fmax)
-        width = int(max(15, TONE_BACKGROUND_HZ / step)) | 1
-        tried = int(looked.sum())
-        if tried < width:
-            continue
-        # the median of an exponential law is log 2 of its mean
-        background = median_filter(power, width, mode="nearest") / math.log(2.0) + 1e-30
-        excess = np.where(looked, power / background, 0.0)
-        k = int(np.argmax(excess))
-        if excess[k] - math.log(tried) > best:
-            best = float(excess[k]) - math.log(tried)
-            line = float(frequency[k]) + step * _between_bins(power[k - 1 : k + 2]), tried
-    return line
-
-
-def _between_bins(power: FloatArray) -> float:
-    """Where a line lies beside the middle one of three bins of its power under Hann's window [bins]."""
-    below, at, above = np.sqrt(power)
-    shift = (2.0 * above - at) / (at + above) if above > below else (at - 2.0 * below) / (below + at)
-    return float(np.clip(shift, -1.0, 1.0))

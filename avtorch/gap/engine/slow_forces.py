@@ -6,7 +6,7 @@ not. In band b of the lapped transform the residuals of the two channels are Gau
     V_b = P_b 1 1' + diag(a_b, c_b),        P_b = int G_b(f) S(f) df,
 
 where S is the one-sided spectrum of the common force, G_b what the transform makes of a tone, and the variances a_b,
-c_b of the sensors are free. Three spectra compete:
+c_b of the sensors are free. Spectra compete:
 
     process noise    2 q^2 |H(f)|^2,  H = (x j w + T) / (1 - x w^2 + T j w)    white jerk, pulled back by the actuator
     gust             4 s^2 tau / (1 + (w tau)^2)                               Ornstein-Uhlenbeck (Dryden, MIL-F-8785C)
@@ -28,7 +28,7 @@ R_b the road's power, c that of the speed's white noise.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -39,7 +39,7 @@ from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance
-from avtorch.gap.engine.priors import ONSET_ODDS
+from avtorch.gap.engine.priors import BAND_RATIO, ONSET_ODDS
 
 # priors: log-normal, by mean and standard deviation of the logarithm
 PROCESS_NOISE = (0.03, 0.8)
@@ -53,6 +53,11 @@ ROAD_SD_MPS2 = (0.25, 0.9)
 ROAD_LENGTH_M = (450.0, 0.6)
 """Shortest wavelength of a grade [m]: vertical curves are built to be seen ahead over (AASHTO sight distances)."""
 
+CYCLE_SD_MPS2 = GUST_SD_MPS2
+"""Size of a cycle [m/s²]: as that of a gust."""
+CYCLE_WIDTH = 0.05
+"""Standard deviation of its frequency over its mean [-]: half a band, so that no line falls between two."""
+
 # grids: wide enough for three standard deviations of the priors, ratios of 1.3 to 1.5
 PROCESS_NOISE_GRID = np.geomspace(0.004, 0.6, 20)
 _GRID_RATIO = float(PROCESS_NOISE_GRID[1] / PROCESS_NOISE_GRID[0])
@@ -61,6 +66,8 @@ PROCESS_NOISE_STEPS = (0, 2, 4, 7, 10)
 SIZE_GRID_MPS2 = np.geomspace(0.02, 0.8, 16)
 GUST_TIME_GRID_S = np.array([0.7, 1.0, 1.5, 2.2, 3.2, 4.7, 7.0])
 ROAD_LENGTH_GRID_M = np.array([180.0, 280.0, 420.0, 650.0, 1000.0])
+CYCLE_HZ = (0.1, 1.9)
+"""Frequencies of cycles [Hz], in half bands: what is slower is a gust or a road."""
 PULLING_LAG_RATIOS = 2.0 ** np.arange(6)
 """Lags over the actuator's own, by which a saturated actuator pulls back what disturbs it [-]."""
 ONSET_SHARES = (0.12, 0.85)
@@ -85,6 +92,8 @@ class SlowForces:
     [nats]: what either gains over it, the difference of priors included. `process_noise` [m/s³/√Hz] alone; `gust_sd`,
     `road_sd` [m/s²]; `gust_time` [s]; `road_length` [m]: the best of each grid.
 
+    `cycle` [nats], its `cycle_sd` [m/s²] and `cycle_hz`: likewise; no nats where it was not asked for.
+
     `process_power` (band,) [(m/s²)²] at the best gust; `covariance` (band, channel, channel) and `counts`
     (band,) are what was explained; `sensor` (band, channel, channel): factors by which a covariance becomes that before
     a sensor that lags or has another scale.
@@ -105,6 +114,10 @@ class SlowForces:
     covariance: FloatArray = field(repr=False)
     counts: FloatArray = field(repr=False)
     sensor: FloatArray = field(repr=False)
+    cycle: float = -math.inf
+    cycle_sd: float = 0.0
+    cycle_hz: float = 0.0
+    process_noise_beside_cycle: float = 0.0
 
 
 # spectra --------------------------------------------------------------------------------------------------------------
@@ -122,6 +135,13 @@ def gust_spectrum(frequency: FloatArray, time: float | FloatArray) -> FloatArray
     [s] (...,)."""
     tau = np.asarray(time, float)[..., None]
     return 4 * tau / (1 + (2 * np.pi * frequency * tau) ** 2)
+
+
+def cycle_spectrum(frequency: FloatArray, line: float | FloatArray) -> FloatArray:
+    """One-sided spectrum (..., tone) [1/Hz] of variance 1 about a `line` [Hz] (...,), normal with `CYCLE_WIDTH`."""
+    at = np.asarray(line, float)[..., None]
+    width = CYCLE_WIDTH * at
+    return np.asarray(np.exp(-0.5 * ((frequency - at) / width) ** 2) / (math.sqrt(2 * math.pi) * width), float)
 
 
 def road_spectrum(frequency: FloatArray, corner: float | FloatArray) -> FloatArray:
@@ -249,8 +269,12 @@ def slow_forces(
     values: FloatArray,
     given: tuple[FloatArray, FloatArray] | None = None,
     lags: FloatArray | None = None,
+    *,
+    cycle: bool = False,
 ) -> SlowForces:
     """Process noise, gust and road in `residual` (channel, frame, bin) of a hypothesis with `values` (parameter,).
+
+    With `cycle`, a cycle too.
 
     `given`: covariance (band, channel, channel) and counts (band,) in place of the residual's; bands beyond `SLOW_HZ`
     are ignored. `lags` (lag,) [s], see `pulling_lags`: the likeliest counts; T_L where not given.
@@ -298,7 +322,7 @@ def slow_forces(
     gust, (g0, g1, g2) = best(gusts, GUST_SD_MPS2, _log_normal(GUST_TIME_GRID_S, GUST_TIME_S))
     roads = road_spectrum(frequency, _mean_speed(data) / ROAD_LENGTH_GRID_M) @ energy.T
     road, (r0, r1, r2) = best(roads, ROAD_SD_MPS2, _log_normal(ROAD_LENGTH_GRID_M, ROAD_LENGTH_M), road=True)
-    return SlowForces(
+    found = SlowForces(
         log_likelihood=base,
         bands=bands,
         process_noise=size,
@@ -315,6 +339,39 @@ def slow_forces(
         counts=counts,
         sensor=sensor,
     )
+    if not cycle:
+        return found
+    lines = np.geomspace(*CYCLE_HZ, 1 + round(math.log(CYCLE_HZ[1] / CYCLE_HZ[0]) / (0.5 * math.log(BAND_RATIO))))
+    cycles = cycle_spectrum(frequency, lines) @ energy.T
+    # one of so many bands: two lines a band are not two
+    gain, (c0, c1, c2) = best(cycles, CYCLE_SD_MPS2, np.full(len(lines), -math.log(len(lines) / 2)))
+    return replace(
+        found,
+        cycle=gain,
+        cycle_sd=float(SIZE_GRID_MPS2[c1]),
+        cycle_hz=float(lines[c2]),
+        process_noise_beside_cycle=float(sizes[c0]),
+    )
+
+
+def cycle_response(data: DriveData, residual: FloatArray, found: SlowForces) -> FloatArray:
+    """What a cycle is expected to have done, given a `residual` (channel, frame, bin) of two channels; the same shape.
+
+    The mean of a Gaussian of power P beside noise of the covariance V: P 1 1' V^-1 r.
+    """
+    frequency, energy = data.band_response
+    power = found.cycle_sd**2 * (cycle_spectrum(frequency, found.cycle_hz) @ energy.T)
+    process = found.process_power * (found.process_noise_beside_cycle / found.process_noise_beside_gust) ** 2
+    variances = wishart_profile(found.covariance, found.counts, power + process)[1]
+    V = (power + process)[:, None, None] + np.eye(2) * variances[:, None]
+    scale = np.sqrt(np.diagonal(found.sensor, axis1=1, axis2=2))  # (band, channel)
+    weights = power[:, None] * np.linalg.solve(V, np.ones((found.bands, 2, 1)))[..., 0] * scale
+    out = np.zeros_like(residual)
+    edges = data.band_edges[: found.bands + 1]
+    weight, scale = (np.repeat(x, np.diff(edges), axis=0) for x in (weights, scale))
+    common = np.einsum("bc,cfb->fb", weight, residual[:, :, : edges[-1]])
+    out[:, :, : edges[-1]] = common / scale.T[:, None]
+    return out
 
 
 class SlowOnset(NamedTuple):

@@ -16,10 +16,8 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.free_forms import (
     COEFFICIENT_SD,
-    TONE_HZ,
     FreeForm,
     _bent,
-    _between_bins,
     _first_order_backwards,
     _moved,
     band_products,
@@ -28,7 +26,7 @@ from avtorch.gap.engine.free_forms import (
     families,
     first_order,
     mirror_columns,
-    tone,
+    sensor_form,
     wandering,
 )
 from avtorch.gap.engine.gauss_newton import fit, jacobian, prior_terms, whitened_jacobian
@@ -77,10 +75,6 @@ def _wandering_delay(time: FloatArray, u: FloatArray) -> FloatArray:
     return np.interp(time - late, time, _lagged(GAIN * u))
 
 
-def _ringing(time: FloatArray, u: FloatArray) -> FloatArray:
-    return _lagged(GAIN * u) + 0.05 * np.sin(2 * np.pi * 0.7137 * time)
-
-
 def _foreseeing(time: FloatArray, u: FloatArray) -> FloatArray:
     return 0.8 * _lagged(GAIN * u) + 0.2 * _lagged(GAIN * u[::-1])[::-1]
 
@@ -100,6 +94,10 @@ def _car(response: Force, channels: tuple[str, ...] = ("accel", "speed"), seed: 
         "speed": speed + random.normal(0.0, SPEED_SD, len(time)),
     }
     data = DriveData.of(Log.from_arrays(time=time, accel_cmd=command, **{c: readings[c] for c in channels}))
+    return _fitted(data)
+
+
+def _fitted(data: DriveData) -> Hypothesis:
     h = fit(Hypothesis(data), 12)
     h.jacobian = jacobian(h, h.free)
     whitened = whitened_jacobian(h, h.jacobian)
@@ -234,7 +232,7 @@ def test_nothing_is_found_where_nothing_is_missing(channels: tuple[str, ...]) ->
     forms = families(h)
     assert set(forms) == ({"linear", "sided", "map"} if "speed" in channels else {"linear", "sided"})
     fits = [block(h, f) for f in [*forms.values(), mirror_columns(h)]]
-    fits += [*wandering(h).values(), tone(h).fit]
+    fits += [*wandering(h).values(), *([block(h, sensor_form(h))] if len(channels) == 2 else [])]
     assert max(f.nats for f in fits) < 0.0
 
 
@@ -250,6 +248,13 @@ def test_the_family_of_the_cause_gains_most(response: Force, family: str) -> Non
     nats |= {name: found.nats for name, found in wandering(h).items()}
     assert max(nats, key=lambda name: nats[name]) == family
     assert nats[family] > 20.0
+
+
+def test_dynamics_of_one_reading_are_the_sensors() -> None:
+    """A recorder's filter is below 50 ms; both channels of the car share its own lag."""
+    data = _car(_lags).data
+    h = _fitted(data.with_accel(_lagged(data.accel)))
+    assert block(h, sensor_form(h)).nats > block(h, families(h)["linear"]).nats + 20.0
 
 
 def test_an_answer_before_the_command_is_the_mirrors() -> None:
@@ -275,34 +280,3 @@ def test_a_course_that_wanders_is_found_again(response: Force, kind: str, size: 
     truth -= truth.mean()
     assert np.corrcoef(course, truth)[0, 1] > 0.95
     assert np.std(course) == pytest.approx(np.std(truth), rel=0.3)
-
-
-def test_a_tone_is_found_with_frequency_and_size() -> None:
-    h = _car(_ringing)
-    found = tone(h)
-    assert found.fit.nats > 20.0
-    # Cramer and Rao: sd of a frequency sqrt(6) / (pi T^1.5 amplitude) sqrt(noise's density)
-    density = ACCEL_SD**2 * DT * 2
-    bound = math.sqrt(6 * density) / (math.pi * 146.0**1.5 * 0.05)
-    # Hann's window and interpolation double it
-    assert found.frequency == pytest.approx(0.7137, abs=10 * bound)
-    size = np.hypot(*found.fit.coefficients[:2])
-    assert size == pytest.approx(0.05, abs=5 * math.sqrt(density / 146.0) * 2)
-
-
-def test_tones_above_those_of_loops_are_left_alone() -> None:
-    assert tone(_car(_ringing), 0.8).fit.nats < 0.0
-    h = _car(_lags)
-    assert tone(h).frequency < TONE_HZ
-    low = fit(Hypothesis(h.data.below(1.3), alone=True), 12)
-    low.jacobian = jacobian(low, low.free)
-    low.information = np.eye(len(low.free))  # of no account for the frequency
-    assert tone(low).frequency < 1.3
-
-
-def test_line_between_bins_is_exact_for_a_hann_window(fresh_seed: int) -> None:
-    random = np.random.default_rng(fresh_seed)
-    n, bin_number, shift = 4000, 300, float(random.uniform(-0.49, 0.49))
-    wave = np.cos(2 * np.pi * (bin_number + shift) * np.arange(n) / n + random.uniform(0, 6))
-    power = np.abs(np.fft.rfft(wave * np.hanning(n))) ** 2
-    assert _between_bins(power[bin_number - 1 : bin_number + 2]) == pytest.approx(shift, abs=2e-3)

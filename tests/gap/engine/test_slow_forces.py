@@ -13,11 +13,13 @@ from avtorch.gap.engine.coordinates import INDEX, NEUTRAL
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance
-from avtorch.gap.engine.priors import SLOW_HZ
+from avtorch.gap.engine.priors import BAND_RATIO, SLOW_HZ
 from avtorch.gap.engine.slow_forces import (
     GUST_TIME_GRID_S,
     PROCESS_NOISE_GRID,
     SIZE_GRID_MPS2,
+    cycle_response,
+    cycle_spectrum,
     gust_spectrum,
     process_spectrum,
     pulling_lags,
@@ -62,8 +64,12 @@ def _residual(data: DriveData, rng: np.random.Generator, force: FloatArray) -> F
 # spectra and the transform --------------------------------------------------------------------------------------------
 def test_spectra_have_the_variance_of_their_process() -> None:
     # the variance of white jerk behind a lag is q² T / 2
-    of = {"gust": 1.0, "process": T_L / 2}
-    spectra = {"gust": lambda f: gust_spectrum(f, 1.7), "process": lambda f: process_spectrum(f, T_L)}
+    of = {"gust": 1.0, "process": T_L / 2, "cycle": 1.0}
+    spectra = {
+        "gust": lambda f: gust_spectrum(f, 1.7),
+        "process": lambda f: process_spectrum(f, T_L),
+        "cycle": lambda f: cycle_spectrum(f, 0.7),
+    }
     for name, spectrum in spectra.items():
         total = quad(lambda f, s=spectrum: float(s(np.array([f]))[0]), 0, np.inf)[0]
         assert total == pytest.approx(of[name], rel=1e-6)  # accuracy of the quadrature
@@ -169,6 +175,35 @@ def test_without_a_gust_the_best_one_gains_nothing(rotating_seed: int) -> None:
         found = slow_forces(data, _residual(data, rng, _process_noise(rng, rows, q)), NEUTRAL)
         # of 112 gusts and 80 roads beside five sizes of process noise the best; grids are coarse by half a nat
         assert max(found.gust, found.road) < log_odds(5 * 192) + 0.5
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("from_s", [0, 300], ids=["throughout", "late"])
+def test_a_force_that_swings_is_a_cycle_and_no_gust(from_s: float, rotating_seed: int) -> None:
+    rng, data = np.random.default_rng(rotating_seed), _data(600)
+    rows = len(data.time)
+    hertz = float(np.exp(rng.uniform(*np.log([0.15, 1.5]))))
+    swing = np.where(data.time >= from_s, 0.3 * np.sin(2 * np.pi * hertz * data.time + rng.uniform(0, 6)), 0.0)
+    residual = _residual(data, rng, swing + _process_noise(rng, rows, 0.03))
+    found = slow_forces(data, residual, NEUTRAL, cycle=True)
+    assert found.cycle > max(found.gust, found.road, 0.0) + log_odds()
+    # lines lie half a band apart, and what is in one band is not told from its neighbour's edge
+    assert abs(np.log(found.cycle_hz / hertz)) < np.log(BAND_RATIO)
+    back = cycle_response(data, residual, found)
+    truth = data.transform([swing] * 2)
+    # noise of the sensors in a band of 22 % about the line is a tenth of the swing's power, or less
+    assert np.corrcoef(back.ravel(), truth.ravel())[0, 1] > 0.9
+
+
+@pytest.mark.statistical
+def test_gusts_and_process_noise_are_no_cycle(rotating_seed: int) -> None:
+    rng, data = np.random.default_rng(rotating_seed), _data(600)
+    rows = len(data.time)
+    for gust in (0.0, 0.2):
+        force = gust * _ornstein_uhlenbeck(rng, rows, 2.0) + _process_noise(rng, rows, 0.04)
+        found = slow_forces(data, _residual(data, rng, force), NEUTRAL, cycle=True)
+        # of 30 lines of 16 sizes beside five sizes of process noise the best
+        assert found.cycle < max(found.gust, 0.0) + log_odds(5 * 16 * 30)
 
 
 @pytest.mark.statistical
