@@ -23,6 +23,7 @@ FORMS = {
     "map": ("force map", "a force map"),
     "sensor": ("sensor", "other dynamics of a reading"),
     "gain": ("time", "a gain that wanders"),
+    "braking": ("time", "a gain of the brakes that wanders"),
     "delay": ("time", "a delay that wanders"),
 }
 """Family of each free form, and what it is."""

@@ -40,7 +40,7 @@ LAG_RATIOS = (0.3, 1.0, 3.0, 10.0)
 """Lags of a linear bank over the car's own [-]: half a decade apart, and twice that at the slow end."""
 SHORTEST_LAG_S = 0.03
 """Shortest lag of a bank [s]; what is faster belongs to the recorder."""
-WANDER_SD = {"gain": 0.2, "delay": 0.12}
+WANDER_SD = {"gain": 0.2, "braking": 0.2, "delay": 0.12}
 """Typical sd of a wandering gain [-] and of a wandering delay [s]."""
 WANDER_RATIOS = (0.3, 1.0, 2.0)
 """Sizes over the typical one [-] that are tried: weaker ones are not seen, larger ones are no wandering any more."""
@@ -313,14 +313,16 @@ def _first_order_backwards(
 
 
 def _wandering_responses(h: Hypothesis) -> dict[str, FloatArray]:
-    """Derivative (channel, frame, bin) of the response by the logarithm of its gain and by a delay of all channels."""
+    """Derivative (channel, frame, bin) of the response by the logarithm of its gain, of that of braking alone, and by a
+    delay of all channels."""
     late, early = h.values.copy(), h.values.copy()
     for channel in h.data.channels:
         late[INDEX[f"{channel}_delay"]] += _DELAY_STEP_S
         early[INDEX[f"{channel}_delay"]] -= _DELAY_STEP_S
     signals = h.on_grid()
     change = h.data.transform(h.recorded(*signals, late)) - h.data.transform(h.recorded(*signals, early))
-    return {"gain": h.predicted, "delay": change / (2.0 * _DELAY_STEP_S)}
+    braking = demand_response(h, np.minimum(h["K_L"] * h.command(), 0.0)[None], np.array([h["T_L"]]))[0]
+    return {"gain": h.predicted, "braking": braking, "delay": change / (2.0 * _DELAY_STEP_S)}
 
 
 def _wandering(h: Hypothesis, response: FloatArray, sd: float) -> FreeFormFit:

@@ -70,6 +70,11 @@ def _wandering_gain(time: FloatArray, u: FloatArray) -> FloatArray:
     return _lagged(GAIN * u * (1.0 + 0.25 * np.sin(2 * np.pi * time / 60.0)))
 
 
+def _wandering_brakes(time: FloatArray, u: FloatArray) -> FloatArray:
+    force = np.where(u < 0, 1.0 + 0.25 * np.sin(2 * np.pi * time / 60.0), 1.0)
+    return _lagged(GAIN * force * u)
+
+
 def _wandering_delay(time: FloatArray, u: FloatArray) -> FloatArray:
     late = 0.1 + 0.1 * np.sin(2 * np.pi * time / 60.0)
     return np.interp(time - late, time, _lagged(GAIN * u))
@@ -264,8 +269,8 @@ def test_an_answer_before_the_command_is_the_mirrors() -> None:
 
 @pytest.mark.parametrize(
     ("response", "kind", "size"),
-    [(_wandering_gain, "gain", 0.25), (_wandering_delay, "delay", 0.1)],
-    ids=["gain", "delay"],
+    [(_wandering_gain, "gain", 0.25), (_wandering_brakes, "braking", 0.25), (_wandering_delay, "delay", 0.1)],
+    ids=["gain", "brakes", "delay"],
 )
 def test_a_course_that_wanders_is_found_again(response: Force, kind: str, size: float) -> None:
     """Its course is a sine of 60 s in frames of 5 s. The frames' overlap smooths a few per cent away; the prior pulls

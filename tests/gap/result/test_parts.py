@@ -33,5 +33,5 @@ def test_what_is_unlikely_is_not_said() -> None:
 
 
 def test_every_free_form_has_a_family() -> None:
-    for form in ("linear", "sided", "cycle", "sensor", "map", "gain", "delay"):
+    for form in ("linear", "sided", "cycle", "sensor", "map", "gain", "braking", "delay"):
         assert FORMS[form]
