@@ -66,8 +66,8 @@ PROCESS_NOISE_STEPS = (0, 2, 4, 7, 10)
 SIZE_GRID_MPS2 = np.geomspace(0.02, 0.8, 16)
 GUST_TIME_GRID_S = np.array([0.7, 1.0, 1.5, 2.2, 3.2, 4.7, 7.0])
 ROAD_LENGTH_GRID_M = np.array([180.0, 280.0, 420.0, 650.0, 1000.0])
-CYCLE_HZ = (0.1, 1.9)
-"""Frequencies of cycles [Hz], in half bands: what is slower is a gust or a road."""
+CYCLE_HZ = (0.2, 1.9)
+"""Frequencies of cycles [Hz], in half bands: at 20 m/s a road has slower ones, of waves of 100 m and more."""
 PULLING_LAG_RATIOS = 2.0 ** np.arange(6)
 """Lags over the actuator's own, by which a saturated actuator pulls back what disturbs it [-]."""
 ONSET_SHARES = (0.12, 0.85)

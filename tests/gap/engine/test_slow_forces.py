@@ -182,7 +182,7 @@ def test_without_a_gust_the_best_one_gains_nothing(rotating_seed: int) -> None:
 def test_a_force_that_swings_is_a_cycle_and_no_gust(from_s: float, rotating_seed: int) -> None:
     rng, data = np.random.default_rng(rotating_seed), _data(600)
     rows = len(data.time)
-    hertz = float(np.exp(rng.uniform(*np.log([0.15, 1.5]))))
+    hertz = float(np.exp(rng.uniform(*np.log([0.25, 1.5]))))
     swing = np.where(data.time >= from_s, 0.3 * np.sin(2 * np.pi * hertz * data.time + rng.uniform(0, 6)), 0.0)
     residual = _residual(data, rng, swing + _process_noise(rng, rows, 0.03))
     found = slow_forces(data, residual, NEUTRAL, cycle=True)
@@ -202,8 +202,8 @@ def test_gusts_and_process_noise_are_no_cycle(rotating_seed: int) -> None:
     for gust in (0.0, 0.2):
         force = gust * _ornstein_uhlenbeck(rng, rows, 2.0) + _process_noise(rng, rows, 0.04)
         found = slow_forces(data, _residual(data, rng, force), NEUTRAL, cycle=True)
-        # of 30 lines of 16 sizes beside five sizes of process noise the best
-        assert found.cycle < max(found.gust, 0.0) + log_odds(5 * 16 * 30)
+        # of 23 lines of 16 sizes beside five sizes of process noise the best
+        assert found.cycle < max(found.gust, 0.0) + log_odds(5 * 16 * 23)
 
 
 @pytest.mark.statistical
