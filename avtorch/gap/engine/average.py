@@ -47,6 +47,7 @@ from avtorch.gap.engine.priors import (
     UNKNOWN_NATS,
     WITHIN_NATS,
 )
+from avtorch.gap.engine.roughness import SIGNS, roughness
 from avtorch.gap.engine.search import Search
 from avtorch.gap.engine.shape_error import relative_size, shape_likelihood, shape_log_odds, shape_log_prior
 from avtorch.gap.engine.slow_forces import SlowForces, SlowOnset, cycle_response, pulling_lags, slow_forces, slow_onset
@@ -57,6 +58,7 @@ _LINEAR = frozenset({"dead_time", "second_order_actuator", "sensor_lag", "speed_
 _FAINT_GUST = FAINT_OF_RANGE * TABLE["gust"].parameters[0].low
 _LARGE_OF_COMMAND = 0.2  # a slow force has a name, with one channel, from this share of the command's spread on
 _LEAST_LISTED = 1e-4
+_LEAST_FORM_NATS = -6.0  # a free form that loses more is not listed
 Key = TypeVar("Key", str, frozenset[str])
 
 SLOW = ("none", "gust", "road_grade")
@@ -177,12 +179,12 @@ def examine(h: Hypothesis, search: Search) -> Examined:
         forms, mirror = _free_forms(h, search)
         late = {kind: slow_onset(data, h.residual, first, kind) for kind in ("gust", "road")}
         compositions += [
-            _composed(h, name, found.nats, found.residual, exact, lags, least=-6.0)
+            _composed(h, name, found.nats, found.residual, exact, lags, least=_LEAST_FORM_NATS)
             for name, found in forms.items()
             if found.residual is not None
         ]
         compositions = [_set_in(c, late) for c in compositions if c is not None]
-        compositions.append(_cycle(h, compositions[0]))
+        compositions += [_cycle(h, compositions[0]), *(_rough(h, compositions[0], form) for form in SIGNS)]
     beside = {}
     for e in h.effects if len(h.effects) > 1 else []:
         rest = search.without(h, e)
@@ -214,7 +216,7 @@ def free_form_response(x: Examined, search: Search, form: str) -> FloatArray | N
     h = x.hypothesis
     if form == "cycle":
         return cycle_response(h.data, h.residual, x.compositions[0].slow)
-    forms, _ = _free_forms(h, search)
+    forms = {form: roughness(h, form)} if form in SIGNS else _free_forms(h, search)[0]
     left = forms[form].residual if form in forms else None
     return None if left is None else h.residual - left
 
@@ -339,6 +341,22 @@ def _cycle(h: Hypothesis, plain: Composition) -> Composition:
         done = cycle_response(h.data, h.residual, plain.slow)
         relative = relative_size(h.data, h.covariance, done, h.effect_energy)
     return Composition("cycle", total - plain.total["none"], relative, {"none": total}, plain.slow)
+
+
+def _rough(h: Hypothesis, plain: Composition, form: str) -> Composition | None:
+    """A force that is there while braking, or driving, beside the slow forces of a `plain` composition.
+
+    Errors of the effects' shape are energy in the same frames: it counts by what it gains over them.
+    """
+    found = roughness(h, form)
+    nats = found.nats - max(log_sum(h.shape_log), 0.0)
+    if nats < _LEAST_FORM_NATS or found.residual is None:
+        return None
+    relative = 99.0
+    if h.effect_energy is not None:
+        relative = relative_size(h.data, h.covariance, h.residual - found.residual, h.effect_energy)
+    total = {slow: plain.total[slow] + nats for slow in SLOW}
+    return replace(plain, form=form, nats=nats, relative=relative, total=total)
 
 
 def _set_in(c: Composition, late: Mapping[str, SlowOnset]) -> Composition:

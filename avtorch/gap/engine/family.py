@@ -25,6 +25,8 @@ FORMS = {
     "gain": ("time", "a gain that wanders"),
     "braking": ("time", "a gain of the brakes that wanders"),
     "delay": ("time", "a delay that wanders"),
+    "rough_braking": ("chance", "a random force while braking"),
+    "rough_driving": ("chance", "a random force while driving"),
 }
 """Family of each free form, and what it is."""
 OWN = "own"

@@ -121,13 +121,23 @@ def shape_likelihood(
     bands = claim_bands(data)
     observed = frame_energy(data, residual)[:, :bands]
     sizes = np.diff(data.band_edges)[:bands].astype(float)
-    channels = residual.shape[0]
-    nats, covariances, counts = _noise_beside(
-        _packed(observed, 1.0), _packed(energy[:, :bands], 0.0), sizes, np.array(RELATIVE_ERRORS), channels, iterations
-    )
-    unpacked = np.stack([covariances[..., :2], covariances[..., 1:]], -2)[..., :channels, :channels]
+    nats, covariances, counts = noise_beside(observed, energy[:, :bands], sizes, np.array(RELATIVE_ERRORS), iterations)
     total = nats.sum(1)
-    return ShapeLikelihood(total - total[0], np.ascontiguousarray(unpacked), counts)
+    return ShapeLikelihood(total - total[0], covariances, counts)
+
+
+def noise_beside(
+    observed: FloatArray, energy: FloatArray, sizes: FloatArray, errors: FloatArray, iterations: int = 30
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The noise of each band beside something random of squared `errors` (error,) times `energy` (frame, band, channel,
+    channel) in a residual of energy `observed` (the same), `sizes` (band,) coefficients a frame: log likelihood [nats]
+    (error, band), covariance (error, band, channel, channel), effective counts (error, band)."""
+    channels = observed.shape[-1]
+    nats, packed, counts = _noise_beside(
+        _packed(observed, 1.0), _packed(energy, 0.0), sizes, errors, channels, iterations
+    )
+    covariances = np.stack([packed[..., :2], packed[..., 1:]], -2)[..., :channels, :channels]
+    return nats, np.ascontiguousarray(covariances), counts
 
 
 def shape_log_odds(relative: float, gain: float, effects: Iterable[str]) -> float:

@@ -22,6 +22,7 @@ from avtorch.gap.engine.free_forms import (
     _moved,
     band_products,
     block,
+    block_or_late,
     demand_response,
     families,
     first_order,
@@ -32,6 +33,7 @@ from avtorch.gap.engine.free_forms import (
 from avtorch.gap.engine.gauss_newton import fit, jacobian, prior_terms, whitened_jacobian
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import log_likelihood, whiten
+from avtorch.gap.engine.roughness import SIGNS, roughness
 
 DT, SECONDS, LAG, GAIN = 0.02, 150.0, 0.4, 0.9
 ACCEL_SD, SPEED_SD = 0.1, 0.03
@@ -73,6 +75,11 @@ def _wandering_gain(time: FloatArray, u: FloatArray) -> FloatArray:
 def _wandering_brakes(time: FloatArray, u: FloatArray) -> FloatArray:
     force = np.where(u < 0, 1.0 + 0.25 * np.sin(2 * np.pi * time / 60.0), 1.0)
     return _lagged(GAIN * force * u)
+
+
+def _pulsing_brakes(time: FloatArray, u: FloatArray) -> FloatArray:
+    off = (u < -0.5) & (np.sin(2 * np.pi * 1.7 * time) > 0)
+    return _lagged(GAIN * np.where(off, 0.6, 1.0) * u)
 
 
 def _wandering_delay(time: FloatArray, u: FloatArray) -> FloatArray:
@@ -237,7 +244,9 @@ def test_nothing_is_found_where_nothing_is_missing(channels: tuple[str, ...]) ->
     forms = families(h)
     assert set(forms) == ({"linear", "sided", "map"} if "speed" in channels else {"linear", "sided"})
     fits = [block(h, f) for f in [*forms.values(), mirror_columns(h)]]
-    fits += [*wandering(h).values(), *([block(h, sensor_form(h))] if len(channels) == 2 else [])]
+    fits += wandering(h).values()
+    if len(channels) == 2:
+        fits += [block_or_late(h, sensor_form(h)), *(roughness(h, form) for form in SIGNS)]
     assert max(f.nats for f in fits) < 0.0
 
 
@@ -253,6 +262,20 @@ def test_the_family_of_the_cause_gains_most(response: Force, family: str) -> Non
     nats |= {name: found.nats for name, found in wandering(h).items()}
     assert max(nats, key=lambda name: nats[name]) == family
     assert nats[family] > 20.0
+
+
+def test_brakes_that_pulse_are_a_force_while_braking() -> None:
+    """Two fifths of the force go and come back 1.7 times a second, a random force of a tenth of it about that line."""
+    h = _car(_pulsing_brakes)
+    found = {form: roughness(h, form) for form in SIGNS}
+    assert found["rough_braking"].nats > 20.0
+    assert found["rough_driving"].nats < 0.0
+    at = int(np.searchsorted(h.data.frequency[h.data.band_edges[1:-1]], 1.7))
+    assert found["rough_braking"].coefficients[at - 1 : at + 2].max() >= 0.12
+    # what it is expected to have done is in the frames that brake
+    done = np.sum((h.residual - found["rough_braking"].residual) ** 2, axis=(0, 2))
+    braked = demand_response(h, np.minimum(h.command(), 0.0)[None], np.array([LAG]))[0, 0]
+    assert np.corrcoef(done, np.sum(braked**2, axis=-1))[0, 1] > 0.5
 
 
 def test_dynamics_of_one_reading_are_the_sensors() -> None:

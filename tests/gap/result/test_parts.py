@@ -7,6 +7,7 @@ from typing import Any, cast
 
 from avtorch.gap.engine.average import ModelAverage
 from avtorch.gap.engine.family import FORMS
+from avtorch.gap.engine.roughness import SIGNS
 from avtorch.gap.result.hypotheses import parts_of, said_of_unnamed
 
 
@@ -33,5 +34,5 @@ def test_what_is_unlikely_is_not_said() -> None:
 
 
 def test_every_free_form_has_a_family() -> None:
-    for form in ("linear", "sided", "cycle", "sensor", "map", "gain", "braking", "delay"):
+    for form in ("linear", "sided", "cycle", "sensor", "map", "gain", "braking", "delay", *SIGNS):
         assert FORMS[form]
