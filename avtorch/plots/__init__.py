@@ -37,7 +37,7 @@ if TYPE_CHECKING:
         marginals,
         validation_figures,
     )
-    from avtorch.plots.ratios import ratio_figure, ratio_whiskers
+    from avtorch.plots.ratios import ratio_figure
     from avtorch.plots.signatures import effect_signature, signature_figure
     from avtorch.plots.style import STYLE, save, show
     from avtorch.plots.time import (
@@ -58,7 +58,7 @@ _HOME = {
     "pedals": "pedal_figure pedal_lines",
     "plane": "gain_curve region region_figure setting_region stability_figure verdict_legend verdict_map",
     "posteriors": "VALIDATION_PICTURES agreement_scatter exact_density joint_cloud marginals validation_figures",
-    "ratios": "ratio_figure ratio_whiskers",
+    "ratios": "ratio_figure",
     "signatures": "effect_signature signature_figure",
     "style": "STYLE save show",
     "time": "belief_band belief_figure data_quality events motion motion_figure overview_figure probability_figure "
@@ -89,7 +89,6 @@ __all__ = [
     "pedal_lines",
     "probability_figure",
     "ratio_figure",
-    "ratio_whiskers",
     "region",
     "region_figure",
     "save",

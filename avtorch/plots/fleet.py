@@ -97,9 +97,9 @@ def stability_of_cars(ax: Axes, cars: Sequence[Car], target: float) -> Axes:
 
 
 @styled
-def fleet_figure(answer: Mapping[str, Any], *, narrow: bool = False) -> Figure:
-    """Cars of a fleet's answer by T_L and K_L, beside their P(string stable); `narrow`: for a phone."""
-    figure, (first, second) = panels_of(2, 3.6, narrow=narrow)
+def fleet_figure(answer: Mapping[str, Any]) -> Figure:
+    """Cars of a fleet's answer by T_L and K_L, beside their P(string stable)."""
+    figure, (first, second) = panels_of(2, 3.6)
     actuation_of_cars(first, answer["cars"])
     stability_of_cars(second, answer["cars"], answer["target"])
     first.set_title("Actuation", loc="left")

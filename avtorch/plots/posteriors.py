@@ -25,7 +25,7 @@ from torch import Tensor
 from avtorch.arrays import FloatArray
 from avtorch.inference import Posterior, Quadrature
 from avtorch.inference.arviz_export import arviz
-from avtorch.plots.style import BLACK, BLUE, LABELS, NARROW, VERMILLION, legend, short, styled
+from avtorch.plots.style import BLACK, BLUE, LABELS, VERMILLION, legend, short, styled
 from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE, sampling_diagnostics
 from avtorch.validation.validate import Validation
 
@@ -407,10 +407,8 @@ VALIDATION_PICTURES = ("marginals.png", "joint.png", "ranks.png", "agreement.png
 """Every file that `validation_figures` may name."""
 
 
-def validation_figures(validation: Validation, *, narrow: bool = False) -> dict[str, Callable[[], Figure]]:
+def validation_figures(validation: Validation) -> dict[str, Callable[[], Figure]]:
     """The figures of a validation, by the name of the file that each is for; a figure is made when called.
-
-    `narrow`: for a phone, panels one above the other.
 
     Example:
         >>> from avtorch.inference import SamplerSettings
@@ -423,39 +421,39 @@ def validation_figures(validation: Validation, *, narrow: bool = False) -> dict[
     """
     chosen = ChosenWindows(validation)
     figures: dict[str, Callable[[], Figure]] = {
-        "marginals.png": lambda: marginals_figure(chosen, narrow=narrow),
-        "joint.png": lambda: joint_figure(chosen, narrow=narrow),
-        "ranks.png": lambda: ranks_figure(chosen, narrow=narrow),
-        "agreement.png": lambda: agreement_figure(validation, narrow=narrow),
+        "marginals.png": lambda: marginals_figure(chosen),
+        "joint.png": lambda: joint_figure(chosen),
+        "ranks.png": lambda: ranks_figure(chosen),
+        "agreement.png": lambda: agreement_figure(validation),
     }
     if validation.quadrature is not None:
-        figures["ecdf.png"] = lambda: ecdf_figure(chosen, narrow=narrow)
+        figures["ecdf.png"] = lambda: ecdf_figure(chosen)
     return figures
 
 
 @styled
-def marginals_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
+def marginals_figure(chosen: ChosenWindows) -> Figure:
     """Exact marginals with the histograms of SGLD and NUTS; a row a window, a column a parameter."""
     found, names = chosen.validation, chosen.validation.names
-    figure, axes = _panels(len(chosen.windows), len(names), (_wide(names), 2.3), narrow=narrow)
+    figure, axes = _panels(len(chosen.windows), len(names), (_wide(names), 2.3))
     for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
         for name, ax in zip(names, line, strict=True):
             other = None if window.nuts is None else found.nuts[name][..., window.nuts].numpy()
             own = found.sgld[name][..., window.number].numpy()
             marginals(ax, name, own, other, found.quadrature, window.number, truth=chosen.truth(window, name))
-            if row < len(axes) - 1 and not narrow:
+            if row < len(axes) - 1:
                 ax.set_xlabel("")
         line[0].set_title(window.title)
         line[0].set_ylabel("density")
-    _legend(figure, axes, narrow=narrow)
+    _legend(figure, axes)
     return figure
 
 
 @styled
-def joint_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
+def joint_figure(chosen: ChosenWindows) -> Figure:
     """Clouds of lag and gain within the 50 and 90 % regions of exact draws and of NUTS; a panel a window."""
     found = chosen.validation
-    figure, axes = _panels(1, len(chosen.windows), (3.9, 3.7), narrow=narrow)
+    figure, axes = _panels(1, len(chosen.windows), (3.9, 3.7))
     for i, (window, ax) in enumerate(zip(chosen.windows, axes[0], strict=True)):
         references = {} if chosen.exact is None else {"exact": (chosen.exact, i)}
         if window.nuts is not None:
@@ -464,41 +462,41 @@ def joint_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
         truth = None if lag is None or gain is None else (lag, gain)
         joint_cloud(ax, found.sgld, window.number, references=references, truth=truth)
         ax.set_title("\n".join(t for t in (window.title, ax.get_title("left")) if t))
-        if i and not narrow:
+        if i:
             ax.set_ylabel("")
-    _legend(figure, axes, narrow=narrow)
+    _legend(figure, axes)
     return figure
 
 
 @styled
-def ranks_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
+def ranks_figure(chosen: ChosenWindows) -> Figure:
     """Ranks of groups of SGLD's chains, of NUTS and of exact draws in their common pool, by ArviZ; a row a window."""
     names = chosen.validation.names
     rows = len(chosen.groups(0, 0))
     size = (_wide(names), 0.33 * rows + 0.6)
-    figure, axes = _panels(len(chosen.windows), len(names), size, beside=0.9, narrow=narrow)
+    figure, axes = _panels(len(chosen.windows), len(names), size, beside=0.9)
     for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
         for i, (name, ax) in enumerate(zip(names, line, strict=True)):
             groups = chosen.groups(row, i)
             least = min(map(len, groups.values()))
             pool = np.stack([evenly(x, least) for x in groups.values()])
             arviz().plot_rank({name: pool}, bins=RANKS, ax=ax, colors=[_COLOURS[group.split()[0]] for group in groups])
-            ax.set(title="", ylabel="", xlabel=f"rank of {short(name)}" if row == len(axes) - 1 or narrow else "")
+            ax.set(title="", ylabel="", xlabel=f"rank of {short(name)}" if row == len(axes) - 1 else "")
             ax.xaxis.label.set_size("medium")
-            ax.set_yticklabels(list(groups) if narrow or not i else [])
+            ax.set_yticklabels([] if i else list(groups))
         line[0].set_title(window.title)
-    _title(figure, "Ranks of each group in the pool of all draws, as many as are effective: even bars agree", narrow)
+    _title(figure, "Ranks of each group in the pool of all draws, as many as are effective: even bars agree")
     return figure
 
 
 @styled
-def ecdf_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
+def ecdf_figure(chosen: ChosenWindows) -> Figure:
     """Exact probabilities below the draws: their ECDF less the uniform one and its 95 % band, by ArviZ; a row a window.
 
     Draws count by their effective sample size.
     """
     names = chosen.validation.names
-    figure, axes = _panels(len(chosen.windows), len(names), (_wide(names), 2.4), beside=0.5, narrow=narrow)
+    figure, axes = _panels(len(chosen.windows), len(names), (_wide(names), 2.4), beside=0.5)
     for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
         for i, (name, ax) in enumerate(zip(names, line, strict=True)):
             for method, values in chosen.exact_probabilities(row, i).items():
@@ -518,16 +516,16 @@ def ecdf_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
                 )
             ax.set(xlabel=f"exact probability below a draw of {short(name)}", ylabel="" if i else "ECDF less uniform")
         line[0].set_title(window.title)
-    _legend(figure, axes, narrow=narrow)
+    _legend(figure, axes)
     return figure
 
 
 @styled
-def agreement_figure(validation: Validation, *, narrow: bool = False) -> Figure:
+def agreement_figure(validation: Validation) -> Figure:
     """Differences of mean and ratios of SD of every window over the width of its posterior, with the limits."""
     names, found, index = validation.names, validation.agreement, validation.compared
     width, sound = relative_width(validation, index), converged(validation, index)
-    figure, axes = _panels(2, len(names), (_wide(names), 2.75), beside=0.4, sharey="row", narrow=narrow)
+    figure, axes = _panels(2, len(names), (_wide(names), 2.75), beside=0.4, sharey="row")
     measures = [
         ("difference of means [posterior SD]", found.mean_difference, found.mean_error, 0.0, MEAN_TOLERANCE),
         ("ratio of SDs [-]", found.sd_ratio, found.sd_error, 1.0, SD_TOLERANCE),
@@ -554,9 +552,8 @@ def agreement_figure(validation: Validation, *, narrow: bool = False) -> Figure:
         f"SGLD against {METHOD[validation.reference]}: {100 * v.share:.1f} % of {len(index)} windows within all limits"
         f" (95 % interval {100 * v.low:.1f} to {100 * v.high:.1f} %;"
         f" exact draws would be at {100 * v.share_if_exact:.1f} %)",
-        narrow,
     )
-    _legend(figure, axes, where="lower center", narrow=narrow)
+    _legend(figure, axes, where="lower center")
     return figure
 
 
@@ -572,26 +569,22 @@ def _panels(
     *,
     beside: float = 0.3,
     sharey: Literal["row"] | bool = False,
-    narrow: bool = False,
 ) -> tuple[Figure, np.ndarray]:
-    """A figure and its axes (row, column), each of a `panel`'s width and height [in]; `narrow`: all in one column."""
+    """A figure and its axes (row, column), each of a `panel`'s width and height [in]."""
     wide, high = panel
-    if narrow:
-        figure = Figure(figsize=(NARROW, high * rows * columns + 1.4), layout="constrained")
-        return figure, figure.subplots(rows * columns, 1, squeeze=False).reshape(rows, columns)
     figure = Figure(figsize=(wide * columns + beside, high * rows + 0.9), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, sharey=sharey)
 
 
-def _title(figure: Figure, text: str, narrow: bool) -> None:
+def _title(figure: Figure, text: str) -> None:
     """Above all panels, in lines as long as these are wide."""
-    letters = round((9.0 if narrow else 11.0) * figure.get_figwidth())
+    letters = round(11.0 * figure.get_figwidth())
     figure.suptitle("\n".join(textwrap.wrap(text, letters)), fontsize=9.5, color=BLACK)
 
 
-def _legend(figure: Figure, axes: np.ndarray, *, where: str = "upper center", narrow: bool = False) -> None:
+def _legend(figure: Figure, axes: np.ndarray, *, where: str = "upper center") -> None:
     """One legend for all axes, above or below them: in as many columns as there is room for."""
     longest = max((len(label) for ax in axes.flat for label in ax.get_legend_handles_labels()[1]), default=0)
     column = 0.5 + 0.085 * longest  # inches, in the size of a legend's letters
-    columns = 1 if narrow else max(1, min(6, int(figure.get_figwidth() / column)))
+    columns = max(1, min(6, int(figure.get_figwidth() / column)))
     legend(figure, axes.flat, where=where, columns=columns)

@@ -1,7 +1,4 @@
-"""Drawings over time, and figures made of them: motion, beliefs, events, the quality of a log.
-
-Figures are as wide as a desk's page; with `narrow` as a phone.
-"""
+"""Drawings over time, and figures made of them: motion, beliefs, events, the quality of a log."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from avtorch.io import Log
 from avtorch.io.clock import from_start, time_label
-from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, LABELS, NARROW, ORANGE, SKY, VERMILLION, legend, styled
+from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, LABELS, ORANGE, SKY, VERMILLION, legend, styled
 
 _TRACES = {
     "leader": {"color": GREY, "linewidth": 1.2, "zorder": 2.1},
@@ -216,7 +213,7 @@ def _span(ax: Axes, ends: np.ndarray) -> Axes:
 
 # figures -------------------------------------------------------------------------------------------------------------
 @styled
-def motion_figure(answer: Mapping[str, Any], time: ArrayLike, traces: Motion, *, narrow: bool = False) -> Figure:
+def motion_figure(answer: Mapping[str, Any], time: ArrayLike, traces: Motion) -> Figure:
     """Speeds [m/s], accelerations [m/s²] and spacings [m] of a run with and without action, over `time` (time,) [s].
 
     Example:
@@ -227,12 +224,12 @@ def motion_figure(answer: Mapping[str, Any], time: ArrayLike, traces: Motion, *,
         >>> len(motion_figure({"change": {"time_s": 4.0}}, time, traces).axes)
         2
     """
-    figure = Figure(figsize=(NARROW if narrow else _WIDE, 2.3 * len(traces) + 0.6), layout="constrained")
+    figure = Figure(figsize=(_WIDE, 2.3 * len(traces) + 0.6), layout="constrained")
     axes = figure.subplots(len(traces), 1, sharex=True, squeeze=False)[:, 0]
     for ax, (quantity, named) in zip(axes, traces.items(), strict=True):
         motion(_events_of(ax, answer), time, named, quantity=quantity)
     axes[-1].set_xlabel("time [s]")
-    legend(figure, [axes[0]], narrow=narrow, **_ABOVE)
+    legend(figure, [axes[0]], **_ABOVE)
     return figure
 
 
@@ -244,7 +241,6 @@ def belief_figure(
     truth: Mapping[str, Steps] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     log: Log | None = None,
-    narrow: bool = False,
 ) -> Figure:
     """Posterior bands of T_L and K_L over time; with a `log`, the quality of its rows below them.
 
@@ -262,7 +258,7 @@ def belief_figure(
     epoch_s = log.epoch_s if log is not None else (answer or {}).get("epoch_s", 0.0)
     recorded, windows, answer = windows, from_start(windows, epoch_s), _from_start(answer, epoch_s)
     rows = 2 + (log is not None)
-    figure = Figure(figsize=(NARROW if narrow else _WIDE, 5.8 if log is None else 6.8), layout="constrained")
+    figure = Figure(figsize=(_WIDE, 5.8 if log is None else 6.8), layout="constrained")
     heights = [3, 3, 1.3][:rows]
     axes = figure.subplots(rows, 1, sharex=True, height_ratios=heights)
     for ax, name in zip(axes, ("T_L", "K_L"), strict=False):
@@ -271,12 +267,12 @@ def belief_figure(
     if log is not None:
         data_quality(axes[-1], log, recorded)
     axes[-1].set_xlabel(time_label(epoch_s))
-    legend(figure, axes[:2], narrow=narrow, **_ABOVE)
+    legend(figure, axes[:2], **_ABOVE)
     return figure
 
 
 @styled
-def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = None, narrow: bool = False) -> Figure:
+def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = None) -> Figure:
     """P(string stable) over time, with alerts and actions; each action is labelled with the setting it chose.
 
     Example:
@@ -290,7 +286,7 @@ def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = N
     """
     epoch_s = (answer or {}).get("epoch_s", 0.0)
     windows, answer = from_start(windows, epoch_s), _from_start(answer, epoch_s)
-    figure = Figure(figsize=(NARROW if narrow else _WIDE, 3.6), layout="constrained")
+    figure = Figure(figsize=(_WIDE, 3.6), layout="constrained")
     ax = figure.subplots()
     string_probability(_events_of(ax, answer or {}), windows, actions=(answer or {}).get("actions") or ())
     for i, action in enumerate((answer or {}).get("actions") or []):
@@ -298,7 +294,7 @@ def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = N
         ax.annotate(f"strategy {names}", (action["time_s"], 0.04 + 0.09 * (i % 4)), (4, 0), textcoords="offset points",
                     color=GREEN, fontsize=9)  # fmt: skip
     ax.set_xlabel(time_label(epoch_s))
-    legend(figure, [ax], narrow=narrow, **_ABOVE)
+    legend(figure, [ax], **_ABOVE)
     return figure
 
 
@@ -310,7 +306,6 @@ def overview_figure(
     *,
     truth: Mapping[str, Steps] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
-    narrow: bool = False,
 ) -> Figure:
     """A run at one glance: acceleration, belief about lag and gain, P(string stable).
 
@@ -328,7 +323,7 @@ def overview_figure(
         >>> len(overview_figure(answer, log.elapsed, traces).axes)
         4
     """
-    figure = Figure(figsize=(NARROW if narrow else _WIDE, 8.4), layout="constrained")
+    figure = Figure(figsize=(_WIDE, 8.4), layout="constrained")
     axes = figure.subplots(4, 1, sharex=True)
     for ax in axes:
         _events_of(ax, answer)
@@ -337,7 +332,7 @@ def overview_figure(
         belief_band(ax, answer["windows"], name, truth=(truth or {}).get(name), bounds=(bounds or {}).get(name))
     string_probability(axes[3], answer["windows"], actions=answer["actions"])
     axes[3].set_xlabel("time [s]")
-    legend(figure, axes, narrow=narrow, **_ABOVE)
+    legend(figure, axes, **_ABOVE)
     return figure
 
 

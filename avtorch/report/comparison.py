@@ -176,7 +176,7 @@ def _ratios(what: str, ratios: Mapping[str, Quantity], table: Table, caption: st
     told = "; ".join(f"{name} {_told(q)}" for name, q in ratios.items())
     return picture_of(
         "ratios",
-        lambda narrow: ratio_figure(ratios, what, narrow=narrow),
+        ratio_figure(ratios, what),
         table,
         says=f"Ratios {what} with their 90 % intervals, beside one: {told}.",
         caption=caption,

@@ -185,8 +185,7 @@ def _picture(answer: Answer) -> Picture | None:
         f"First: cars by lag and gain, {each}; red: below the target, orange: unlike its siblings or its own past, "
         f"blue: the others{ranks}. Second: the share of cars up to each P(string stable)."
     )
-    draw = lambda narrow: fleet_figure(answer, narrow=narrow)  # noqa: E731
-    return picture_of("fleet", draw, stability_table(answer), caption=caption)
+    return picture_of("fleet", fleet_figure(answer), stability_table(answer), caption=caption)
 
 
 def _method(answer: Answer) -> list[str]:

@@ -56,12 +56,12 @@ def run_html(
     """
     overview = picture_of(
         "overview",
-        lambda narrow: overview_figure(answer, time, traces, truth=truth, bounds=bounds, narrow=narrow),
+        overview_figure(answer, time, traces, truth=truth, bounds=bounds),
         window_table(answer["windows"]),
         caption="Blue: avtorch's belief, or the run with its actions. Dashed: the truth. Hatched: the bounds the "
         "controller was designed for.",
     )
-    motion = picture_of("motion", lambda narrow: motion_figure(answer, time, traces, narrow=narrow))
+    motion = picture_of("motion", motion_figure(answer, time, traces))
     story = story_table(answer)
     more = 1 + len(begun(answer)) + len(answer["actions"]) - len(story.rows)
     page = Page(
@@ -177,7 +177,7 @@ def _regions(regions: Regions | None, truth: Mapping[str, Steps] | None) -> tupl
     clouds = {name: (np.asarray(T)[:_DOTS], np.asarray(K)[:_DOTS]) for name, (T, K) in regions.clouds.items()}
     drawn = picture_of(
         "region",
-        lambda narrow: region_figure(regions.settings, clouds, truth=now, narrow=narrow, points=_POINTS),
+        region_figure(regions.settings, clouds, truth=now, points=_POINTS),
         _shares(regions, now),
         caption="A dot is a draw of the belief. String stable is what lies in the blue.",
     )

@@ -43,7 +43,7 @@ def validation_html(found: Validation, *, origin: Origin | None = None) -> str:
 
 def _sections(found: Validation) -> list[Section]:
     """A picture each, with its table; the exact probabilities only where there is quadrature."""
-    wide, phone = (validation_figures(found, narrow=narrow) for narrow in (False, True))
+    figures = validation_figures(found)
     chosen = ChosenWindows(found)
     parts = {
         "agreement": ("Window by window", _windows),
@@ -55,12 +55,10 @@ def _sections(found: Validation) -> list[Section]:
     return [
         Section(
             title,
-            pictures=(
-                picture_of(name, lambda narrow, f=f"{name}.png": (phone if narrow else wide)[f](), table(chosen)),
-            ),
+            pictures=(picture_of(name, figures[f"{name}.png"](), table(chosen)),),
         )
         for name, (title, table) in parts.items()
-        if f"{name}.png" in wide
+        if f"{name}.png" in figures
     ]
 
 
