@@ -158,7 +158,7 @@ def test_run_detects_the_change_and_acts(tmp_path: Path, capsys: pytest.CaptureF
         for key in ("speed_rms_ratio", "accel_rms_ratio", "min_spacing_m", "jerk_rms_mps3", "clipped_share"):
             assert math.isfinite(figures[key])
         assert "min_ttc_s" in figures
-    pictures = {"motion.png", "belief.png", "probability.png", "region.png", "overview.png"}
+    pictures = {"motion.png", "region.png", "overview.png"}
     assert {p.name for p in tmp_path.glob("[!.]*")} == {"run.json", "run.html", *pictures}
 
 

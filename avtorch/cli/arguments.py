@@ -157,12 +157,6 @@ def free_folder(out: Path) -> None:
             return
 
 
-def folder_without(out: Path, other: str) -> None:
-    """Refuse a folder with an answer whose pictures have the same names as this one's."""
-    if (out / other).exists():
-        raise InputError(f"--out: {out} holds {other}, and pictures of the same names; needs another folder")
-
-
 def origin_of(paths: Sequence[Path], given: Mapping[str, Any]) -> Origin:
     """How an answer is made: by the files as they are now, with a log's mapping file, and by the arguments `given` to
     the command, without paths and what only says how the answer is shown."""

@@ -61,7 +61,6 @@ def estimate(
     given = dict(locals())
     k = arg.three_gains(gains)
     sound = arg.accepted_pair(accepted)
-    arg.folder_without(out, "run.json")
     if mode != "lambda" and estimator not in PASSING_ON:
         raise InputError(f"--mode: has no meaning with --estimator {estimator}, which passes no prior on; leave it out")
 
@@ -109,8 +108,8 @@ def estimate(
     origin = arg.origin_of([log], given)
     notes = () if fit is None else (about_map,)
     pictures = {
-        "belief.png": lambda: plots.belief_figure(answer["windows"], answer=answer, log=drive),
-        "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
+        "belief.png": lambda: plots.belief_figure(answer, log=drive),
+        "probability.png": lambda: plots.probability_figure(answer),
     }
     pages = {PAGE: lambda: estimates_html(found, drive, notes=notes, origin=origin)}
     pedals = lambda staged: write_pedals(fit, staged)  # noqa: E731

@@ -55,7 +55,6 @@ def run(
     """
     given = dict(locals())
     low, high = arg.limits_pair(limits)
-    arg.folder_without(out, "estimates.json")
     if controller == "mpc" and strategy == "3":
         raise InputError("--strategy: found 3 with --controller mpc, needs auto, 1, 2 or none")
     if leader is None and (vehicle is not None or event is not None):
@@ -161,8 +160,6 @@ def _write(
     pictures = {
         "overview.png": lambda: plots.overview_figure(answer, time, traces, truth=truth, bounds=BOUNDS),
         "motion.png": lambda: plots.motion_figure(answer, time, traces),
-        "belief.png": lambda: plots.belief_figure(answer["windows"], answer=answer, truth=truth, bounds=BOUNDS),
-        "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
         "region.png": lambda: plots.region_figure(settings, clouds, truth=vehicle),
     }
     more: Any = {"truth": truth, "bounds": BOUNDS, "regions": Regions(settings, clouds), "origin": origin}

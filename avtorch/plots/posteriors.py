@@ -38,8 +38,8 @@ CONTOURS: dict[str, Any] = {
     "NUTS": {"color": VERMILLION, "linestyle": "--", "linewidth": 1.4},
 }
 TAIL = 5e-4
-#: Most bins of a histogram, and bins of ranks.
-BINS, RANKS = 2000, 10
+#: Most bins of a histogram.
+BINS = 2000
 
 
 def marginals(
@@ -281,10 +281,10 @@ def _edges(values: np.ndarray, width: float) -> np.ndarray:
 
 
 # pictures of a validation -------------------------------------------------------------------------------------------
-#: Exact draws a window, for contours and ranks.
+#: Exact draws a window, for contours.
 EXACT_DRAWS = 4000
-#: Groups that SGLD's chains are joined into for their ranks, and draws of a group at most.
-GROUPS, MOST = 4, 1000
+#: Draws whose exact probabilities are shown, at most.
+MOST = 1000
 
 
 @dataclass(frozen=True)
@@ -333,40 +333,24 @@ class ChosenWindows:
         drawn["SGLD"] = found.sgld.flat[:, window.number]
         return drawn if window.nuts is None else {**drawn, "NUTS": found.nuts.flat[:, window.nuts]}
 
-    def groups(self, row: int, i: int) -> dict[str, FloatArray]:
-        """Draws of the `i`-th parameter by group, as many as are effective: SGLD's chains in four, NUTS, exact."""
-        found, window = self.validation, self.windows[row]
-        parts = found.sgld.draws[:, :, window.number, i].tensor_split(min(GROUPS, found.sgld.draws.shape[0]))
-        worth = self._effective(row, i, "SGLD") / len(parts)
-        named = {f"SGLD {k + 1}": evenly(x.flatten().numpy(), _count(worth, x)) for k, x in enumerate(parts)}
-        drawn = self.draws(row)
-        if "NUTS" in drawn:
-            nuts = drawn["NUTS"][:, i]
-            named["NUTS"] = evenly(nuts.numpy(), _count(self._effective(row, i, "NUTS"), nuts))
-        return {**named, "exact": drawn["exact"][:, i].numpy()} if "exact" in drawn else named
-
     def exact_probabilities(self, row: int, i: int) -> dict[str, FloatArray]:
         """Of draws of the `i`-th parameter that are effective, the exact probability of what is below, by method."""
-        exact, number = self.validation.quadrature, self.windows[row].number
+        found, window = self.validation, self.windows[row]
+        exact, draws = found.quadrature, self.draws(row)
         assert exact is not None
-        one = Quadrature(exact.names, *(getattr(exact, f.name)[[number]] for f in fields(exact)[1:]))
+        one = Quadrature(exact.names, *(getattr(exact, f.name)[[window.number]] for f in fields(exact)[1:]))
+        effective = {"SGLD": found.agreement.ess_bulk[place(found.compared, window.number), i]}
+        if window.nuts is not None:
+            effective["NUTS"] = self._of_nuts[window.nuts, i]
         out = {}
-        for method, draws in self.draws(row).items():
-            if method == "exact":
-                continue
-            some = torch.from_numpy(evenly(draws.numpy(), _count(self._effective(row, i, method), draws)))
+        for method, count in effective.items():
+            some = torch.from_numpy(evenly(draws[method].numpy(), _count(float(count), draws[method])))
             out[method] = one.cdf(some[:, None])[:, 0, i].clamp(0, 1).numpy()
         return out
 
     @cached_property
     def _of_nuts(self) -> Tensor:
         return sampling_diagnostics(self.validation.nuts).ess_bulk
-
-    def _effective(self, row: int, i: int, method: str) -> float:
-        found, window = self.validation, self.windows[row]
-        if method == "SGLD":
-            return float(found.agreement.ess_bulk[place(found.compared, window.number), i])
-        return float(self._of_nuts[window.nuts, i])
 
     def truth(self, window: ChosenWindow, name: str) -> float | None:
         known = self.validation.windows.truth
@@ -403,7 +387,7 @@ def place(index: Tensor, window: int) -> int | None:
 
 _COLOURS = {"SGLD": BLUE, "NUTS": VERMILLION, "exact": EXACT}
 METHOD = {"nuts": "NUTS", "quadrature": "quadrature"}
-VALIDATION_PICTURES = ("marginals.png", "joint.png", "ranks.png", "agreement.png", "ecdf.png")
+VALIDATION_PICTURES = ("marginals.png", "joint.png", "agreement.png", "ecdf.png")
 """Every file that `validation_figures` may name."""
 
 
@@ -417,13 +401,12 @@ def validation_figures(validation: Validation) -> dict[str, Callable[[], Figure]
         >>> quick = dict(settings=SamplerSettings(chains=64), nuts=NutsSettings(1, 20, 10), nuts_windows=1)
         >>> figures = validation_figures(validate(synthetic_windows(1, seed=1), **quick))
         >>> sorted(figures)
-        ['agreement.png', 'ecdf.png', 'joint.png', 'marginals.png', 'ranks.png']
+        ['agreement.png', 'ecdf.png', 'joint.png', 'marginals.png']
     """
     chosen = ChosenWindows(validation)
     figures: dict[str, Callable[[], Figure]] = {
         "marginals.png": lambda: marginals_figure(chosen),
         "joint.png": lambda: joint_figure(chosen),
-        "ranks.png": lambda: ranks_figure(chosen),
         "agreement.png": lambda: agreement_figure(validation),
     }
     if validation.quadrature is not None:
@@ -465,27 +448,6 @@ def joint_figure(chosen: ChosenWindows) -> Figure:
         if i:
             ax.set_ylabel("")
     _legend(figure, axes)
-    return figure
-
-
-@styled
-def ranks_figure(chosen: ChosenWindows) -> Figure:
-    """Ranks of groups of SGLD's chains, of NUTS and of exact draws in their common pool, by ArviZ; a row a window."""
-    names = chosen.validation.names
-    rows = len(chosen.groups(0, 0))
-    size = (_wide(names), 0.33 * rows + 0.6)
-    figure, axes = _panels(len(chosen.windows), len(names), size, beside=0.9)
-    for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
-        for i, (name, ax) in enumerate(zip(names, line, strict=True)):
-            groups = chosen.groups(row, i)
-            least = min(map(len, groups.values()))
-            pool = np.stack([evenly(x, least) for x in groups.values()])
-            arviz().plot_rank({name: pool}, bins=RANKS, ax=ax, colors=[_COLOURS[group.split()[0]] for group in groups])
-            ax.set(title="", ylabel="", xlabel=f"rank of {short(name)}" if row == len(axes) - 1 else "")
-            ax.xaxis.label.set_size("medium")
-            ax.set_yticklabels([] if i else list(groups))
-        line[0].set_title(window.title)
-    _title(figure, "Ranks of each group in the pool of all draws, as many as are effective: even bars agree")
     return figure
 
 

@@ -311,16 +311,3 @@ def test_an_interruption_at_the_nth_call(command: Command, capsys: pytest.Captur
         if len(calls) < n:
             return
     raise AssertionError("the sweep has no end")
-
-
-def test_two_answers_whose_pictures_have_the_same_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    log = write(tmp_path / "drive.csv", **columns())
-    for other, line in (("estimates.json", ["run"]), ("run.json", ["estimate", log])):
-        out = tmp_path / line[0]
-        out.mkdir()
-        (out / other).write_text("{}", encoding="utf-8")
-        assert main([*line, "--out", str(out)]) == 2
-        assert capsys.readouterr().err == (
-            f"avtorch: --out: {out} holds {other}, and pictures of the same names; needs another folder\n"
-        )
-        assert [p.name for p in out.iterdir()] == [other]

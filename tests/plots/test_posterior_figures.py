@@ -21,7 +21,7 @@ from avtorch.validation.windows import synthetic_windows
 
 pytest.importorskip("arviz")
 WINDOWS = 6
-FILES = {"marginals.png", "joint.png", "ranks.png", "ecdf.png", "agreement.png"}
+FILES = {"marginals.png", "joint.png", "ecdf.png", "agreement.png"}
 
 
 @pytest.fixture(scope="module")
@@ -101,8 +101,6 @@ def test_exact_probabilities_are_uniform_and_show_a_shift(validation: Validation
     assert min(p_values[0]) > 1e-3
     assert p_values[1][0] == p_values[0][0]
     assert p_values[1][1] < 1e-9
-    names = ["SGLD 1", "SGLD 2", "SGLD 3", "SGLD 4", "NUTS", "exact"]
-    assert list(ChosenWindows(validation).groups(0, 0)) == names
 
 
 @pytest.mark.slow
