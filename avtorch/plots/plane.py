@@ -66,7 +66,7 @@ def verdict_map(
         )
         if levels:
             lines = ax.contour(x, y, gain, levels=levels, colors="#B07A1E", linewidths=0.7)
-            ax.clabel(lines, fmt=lambda g: f"{g:g}", fontsize=7.5, manual=_inside(lines, x, y))
+            ax.clabel(lines, fmt=lambda g: f"{g:g}", fontsize=8, manual=_inside(lines, x, y))
     ax.grid(False)
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(y[0], y[-1])
