@@ -299,12 +299,12 @@ def test_an_interruption_leaves_the_older_answer_and_its_pictures(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["estimate"], "LOG: missing; needs a file, see avtorch estimate --help"),
+        (["estimate"], "LOG: missing; see avtorch estimate --help"),
         (
             ["compare", "before.csv"],
             "AFTER: missing; needs a file, or two of --simulator and --simulated, see avtorch compare --help",
         ),
-        (["run"], "--out: missing; needs a folder for the answer and the pictures, such as --out out/run"),
+        (["run"], "--out: missing; see avtorch run --help"),
     ],
     ids=lambda x: x[0] if isinstance(x, list) else "",
 )

@@ -115,28 +115,16 @@ app.command(workbench, name="app")
 
 
 def _said(fault: CycloptsError) -> str:
-    """Of a value that a check of ours refuses, the option and what it needs; the parser's own message otherwise."""
+    """What is missing, or the option and what it needs; the parser's own message otherwise."""
     argument = fault.argument
-    if isinstance(fault, MissingArgumentError):
-        return _missing(fault)
     if argument is None:
         return str(fault)
+    if isinstance(fault, MissingArgumentError) and not argument.tokens:
+        name = argument.name if argument.index is None else argument.name.lstrip("-").upper()
+        return f"{name}: missing; see avtorch {' '.join(fault.command_chain or ())} --help"
     if isinstance(fault, ValidationError):
         return f"{argument.name}: {fault.exception_message}"
     return f"{argument.name}: {fault.msg}" if isinstance(fault, CoercionError) and fault.msg else str(fault)
-
-
-def _missing(fault: MissingArgumentError) -> str:
-    """Name the missing argument and give an example; the parser only reports that one is missing."""
-    command = " ".join(fault.command_chain or ())
-    argument = fault.argument
-    if argument is None or argument.tokens:
-        return str(fault)
-    if argument.name == "--out":
-        return f"--out: missing; needs a folder for the answer and the pictures, such as --out out/{command}"
-    if argument.index is not None:
-        return f"{argument.name.lstrip('-').upper()}: missing; needs a file, see avtorch {command} --help"
-    return f"{argument.name}: missing; see avtorch {command} --help"
 
 
 def use_one_thread() -> None:

@@ -95,11 +95,11 @@ def estimate(
         answer["command"] = about_map
 
     from avtorch import plots
-    from avtorch.report import estimates_html
     from avtorch.report.estimates import (
         P_WORDS,
         alert_table,
         dead_time_note,
+        estimates_html,
         estimates_note,
         late_note,
         window_table,

@@ -144,8 +144,7 @@ def _write(
     origin: Origin,
 ) -> None:
     from avtorch import plots
-    from avtorch.report import run_html
-    from avtorch.report.run import Regions
+    from avtorch.report.run import run_html
 
     time, rows = acting.rows.time, acting.rows
     traces: dict[str, dict[str, Any]] = {}
@@ -162,7 +161,7 @@ def _write(
         "motion.png": lambda: plots.motion_figure(answer, time, traces),
         "region.png": lambda: plots.region_figure(settings, clouds, truth=vehicle),
     }
-    more: Any = {"truth": truth, "bounds": BOUNDS, "regions": Regions(settings, clouds), "origin": origin}
+    more: Any = {"truth": truth, "bounds": BOUNDS, "regions": (settings, clouds), "origin": origin}
     write_answer(out, "run.json", answer, pictures, {PAGE: lambda: run_html(answer, time, traces, **more)})
 
 

@@ -346,11 +346,7 @@ def as_log(
         return Log.read(given, map=map, unit=unit, following=following)
     if is_dataframe(given):
         return Log.from_dataframe(given, map=map, unit=unit, following=following)
-    kind = type(given).__name__
-    hint = "; columns by name make one with Log.from_arrays(**columns)" if isinstance(given, dict) else ""
-    if isinstance(given, (list, tuple)):
-        hint = "; one log at a time"
-    raise InputError(f"{argument}: found a {kind}, needs a Log, a path or a DataFrame{hint}")
+    raise InputError(f"{argument}: found a {type(given).__name__}, needs a Log, a path or a DataFrame")
 
 
 def as_logs(

@@ -287,7 +287,7 @@ def test_logs_that_cannot_be_used(search: Search, tmp_path: Path, capsys: pytest
     asked = ["--effects", "gust,sensor_lag"]
     refused(["diagnose", speed_only, *asked], "found sensor_lag, which no log without accel can show", tmp_path, capsys)
     refused(["diagnose", str(tmp_path / "missing.csv")], "missing.csv", tmp_path, capsys)
-    refused(["diagnose"], "LOGS: missing; needs a file", tmp_path, capsys)
+    refused(["diagnose"], "LOGS: missing; see avtorch diagnose --help", tmp_path, capsys)
     assert main(["diagnose", speed_only, "--out", str(tmp_path / "speed.csv")]) == 2
     assert "is a file" in capsys.readouterr().err
 

@@ -98,7 +98,7 @@ def test_another_schema_and_too_much_are_refused(tmp_path: Path) -> None:
 
 
 def test_only_regular_files_are_read(tmp_path: Path) -> None:
-    """A FIFO would keep its reader waiting, a device would never end, a symlink leads elsewhere."""
+    """A FIFO would keep its reader waiting, no regular file would never end, a symlink leads elsewhere."""
     real = tmp_path / "real"
     write_sealed(real, CONTENT, schema=SCHEMA, of={})
     before = real.read_bytes()
@@ -108,9 +108,9 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
     folder.mkdir()
     for path, kind in (
         (link, "a symbolic link"),
-        (fifo, "a named pipe"),
+        (fifo, "no regular file"),
         (folder, "a directory"),
-        (Path("/dev/zero"), "a device"),
+        (Path("/dev/zero"), "no regular file"),
     ):
         with pytest.raises(InputError, match=f"{path.name}: is {kind}") as caught:
             read_sealed(path, schema=SCHEMA)

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from avtorch.errors import InputError
-from avtorch.report import Origin, fleet_html, write_fleet_page
-from avtorch.report.fleet import PLAIN
+from avtorch.report import Origin, write_fleet_page
+from avtorch.report.fleet import PLAIN, fleet_html
 from tests.report.conftest import HOSTILE
 from tests.report.fleets import answer_of
 from tests.report.tree import Element, read

@@ -10,7 +10,7 @@ import os
 
 from avtorch.errors import InputError
 from avtorch.io.formats.apart import open_apart
-from avtorch.io.formats.kinds import NEED, is_recording, kind_at, refuse_missing
+from avtorch.io.formats.kinds import NEED, is_recording, kind_at
 from avtorch.io.formats.listed import Recording
 from avtorch.io.opening import place
 
@@ -32,5 +32,4 @@ def open_recording(path: str | os.PathLike[str]) -> Recording:
     if kind is None:
         what = "a directory without the metadata.yaml of a ROS 2 bag" if os.path.isdir(path) else "no recording"
         raise InputError(f"{place(path)}: is {what}; {NEED} is needed")
-    refuse_missing(place(path), kind)
     return open_apart(path, kind)
