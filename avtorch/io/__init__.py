@@ -18,7 +18,7 @@ from avtorch.io.folder_lock import sole_use
 from avtorch.io.leaders import RawLeader, read_following, read_leader
 from avtorch.io.log import STANDSTILL_MPS, Log, LogSource, as_log, as_logs
 from avtorch.io.quality import Gap, Quality, check
-from avtorch.io.sealed import Damaged, Sealed, fingerprint, read_sealed, read_sealed_bytes, write_sealed
+from avtorch.io.sealed import Damaged, Sealed, fingerprint, read_sealed_bytes, write_sealed
 
 __all__ = [
     "STANDSTILL_MPS",
@@ -39,7 +39,6 @@ __all__ = [
     "read_answer",
     "read_following",
     "read_leader",
-    "read_sealed",
     "read_sealed_bytes",
     "sole_use",
     "write_json",
