@@ -292,7 +292,7 @@ def test_an_interruption_leaves_the_older_answer_and_its_pictures(
 
     monkeypatch.setattr("avtorch.plots.stability_figure", interrupted)
     assert main([*arguments, "--T", "0.7"]) == 130
-    assert capsys.readouterr().err == "avtorch: interrupted; no answer was written\n"
+    assert capsys.readouterr().err == "avtorch: interrupted\n"
     assert visible(tmp_path) == before
 
 

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 from cyclopts import App, CoercionError, CycloptsError, MissingArgumentError, Parameter, ValidationError
 
-from avtorch.cli.arguments import COMMAND_LINE, free_folder
+from avtorch.cli.arguments import COMMAND_LINE
 from avtorch.cli.check import check
 from avtorch.cli.compare import compare
 from avtorch.cli.diagnose import diagnose
@@ -57,20 +57,12 @@ def alone_in_out(command: Callable[..., None]) -> Callable[..., None]:
         if out is None:
             return command(*args, **kwargs)
         from avtorch.io import sole_use
-        from avtorch.io.answer_set import published
 
-        free_folder(out)
-        before = len(published)
-        try:
-            with sole_use(out, work=f"avtorch {command.__name__}") as locked:
-                if not locked:
-                    warning = "the file system has no locks; keep other runs out of this folder"
-                    print(f"avtorch: {out}: {warning}", file=sys.stderr)
-                return command(*args, **kwargs)
-        except KeyboardInterrupt as stop:
-            if len(published) > before and not str(stop):
-                raise KeyboardInterrupt(f"the new answer is in {out}") from None
-            raise
+        with sole_use(out, work=f"avtorch {command.__name__}") as locked:
+            if not locked:
+                warning = "the file system has no locks; keep other runs out of this folder"
+                print(f"avtorch: {out}: {warning}", file=sys.stderr)
+            return command(*args, **kwargs)
 
     return held
 
@@ -158,7 +150,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
         print("avtorch: " + printable(" ".join(f"{where}{fault.strerror or fault}".split())), file=sys.stderr)
         return 2
     except KeyboardInterrupt as stop:
-        print(f"avtorch: interrupted; {printable(str(stop)) or 'no answer was written'}", file=sys.stderr)
+        print(printable(": ".join(filter(None, ("avtorch: interrupted", str(stop))))), file=sys.stderr)
         return 130
     finally:
         COMMAND_LINE.reset(given)

@@ -85,10 +85,8 @@ def estimate(
             found = work(drive, window, progress=step, **options)
     except KeyboardInterrupt:
         if (out / STATE).exists():
-            message = (
-                f"no answer was written; finished windows are kept in {out / STATE}: the same command resumes there"
-            )
-            raise KeyboardInterrupt(message) from None
+            kept = f"finished windows are kept in {out / STATE}: the same command resumes there"
+            raise KeyboardInterrupt(kept) from None
         raise
     answer = estimates_answer(found)
     if fit is not None:

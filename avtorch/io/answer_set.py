@@ -32,9 +32,6 @@ _MOST = 2**30  # bytes of an answer's JSON
 _staged: set[Path] = set()
 """Folders that `answer_set` has yielded: an answer written into one of them is added to its set."""
 
-published: list[Path] = []
-"""Folders in which this process has published answers, in order, for the message of a later interruption."""
-
 
 @contextmanager
 def answer_set(folder: str | os.PathLike[str], names: Sequence[str]) -> Iterator[Path]:
@@ -64,7 +61,6 @@ def answer_set(folder: str | os.PathLike[str], names: Sequence[str]) -> Iterator
             files = _prepared(place, staged, names)
             begun = True
             _put_in_place(place, staged, files, names)
-            published.append(place)
         except BaseException as fault:
             left = f"files of two answers lie in {place} until it is written again"
             if isinstance(fault, OSError):

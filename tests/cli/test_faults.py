@@ -302,10 +302,10 @@ def test_an_interruption_at_the_nth_call(command: Command, capsys: pytest.Captur
             code = command.run("new")
         said = capsys.readouterr().err
         assert code == (0 if said == "" else 130)
-        if said == "" or "the new answer is in" in said:
+        if said == "":
             assert answers.seen() == answers.new
         else:
-            assert answers.judge() in ("old", "mixed")
+            assert answers.judge() in ("old", "mixed", "new")
         answers.follow()
         answers.again()
         if len(calls) < n:
