@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Group
 
 from avtorch.cli import arguments as arg
-from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.simulators import read_simulator, refuse_loop, simulator_of
 from avtorch.cli.talk import Talk
@@ -230,7 +229,7 @@ def diagnose(
         setting=None if setting is None else setting.to_dict(),
         next_experiment=None if ahead is None else ahead.to_dict(),
     )
-    with answer_set(out, (*DIAGNOSIS_FILES, *PEDAL_FILES)) as staged:
+    with answer_set(out, DIAGNOSIS_FILES) as staged:
         pedals = None if fit is None else fit.map
         written = [*found.write(staged), *write_table(ahead, staged)]
         written += write_exports(found.plant, staged, pedals=pedals)
@@ -265,7 +264,7 @@ def _follow(talk: Talk, given: Mapping[str, Any], effects: Sequence[str] | None)
     gap = replace(gap, notes=(*gap.notes, *found.conditional))
     lines = found.sentences()
     answer = replace(found, diagnosis=gap).to_dict()
-    with answer_set(out, (*DIAGNOSIS_FILES, *PEDAL_FILES)) as staged:
+    with answer_set(out, DIAGNOSIS_FILES) as staged:
         written = [*gap.write(staged), *write_exports(gap.plant, staged)]
         write_json(staged / "diagnosis.json", answer)
         written.append(write_report(gap, staged, quality=noted, sections={"The loop": lines}, origin=origin))

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from avtorch.cli import arguments as arg
-from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
@@ -111,7 +110,7 @@ def estimate(
     }
     pages = {PAGE: lambda: estimates_html(found, drive, notes=notes, origin=origin)}
     pedals = lambda staged: write_pedals(fit, staged)  # noqa: E731
-    write_answer(out, "estimates.json", answer, pictures, pages, more=pedals, also=PEDAL_FILES)
+    write_answer(out, "estimates.json", answer, pictures, pages, more=pedals)
     if open_page:
         talk.show(out / PAGE)
     printed = answer | {key: from_start(answer[key], answer["epoch_s"]) for key in ("windows", "alerts")}

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from avtorch.pedals import PedalFit, PedalTable
 
 PICTURE = "pedal_map.png"
-FILES = ("pedal_map.csv", "accel_map.csv", "brake_map.csv", PICTURE)
-"""Every file of a map, named here because `avtorch.pedals` brings SciPy, which a log without pedals does not need."""
 
 
 def commanded(talk: Talk, drives: Sequence[Log]) -> tuple[list[Log], PedalFit | None, str]:
@@ -76,8 +74,8 @@ def _range(name: str, knots: FloatArray) -> str:
 
 
 def write_pedals(fit: PedalFit | None, staged: Path) -> list[Path]:
-    """Write the map, its tables for other tools and its picture into the folder of an answer set that has `FILES`;
-    returns the files. Without a map none.
+    """Write the map, its tables for other tools and its picture into the folder of an answer set; returns the
+    files. Without a map none.
 
     Raises `InputError` where that cannot be done.
     """

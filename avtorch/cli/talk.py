@@ -156,19 +156,16 @@ def write_answer(
     pages: Mapping[str, Callable[[], str]] | None = None,
     *,
     more: Callable[[Path], object] = lambda staged: None,
-    also: Sequence[str] = (),
 ) -> None:
-    """Publish the answer, its pictures and its pages as one set; `more` writes further files into it, out of `also`,
-    the files that an earlier answer of this kind may have left."""
+    """Publish the answer, its pictures and its pages as one set; `more` writes further files into it."""
     from avtorch.io import answer_set, write_json
     from avtorch.plots import save
     from avtorch.report.page import written
 
-    pictures, pages = pictures or {}, pages or {}
-    with answer_set(out, list(dict.fromkeys([name, *pictures, *pages, *also]))) as staged:
-        for file, draw in pictures.items():
+    with answer_set(out, [name]) as staged:
+        for file, draw in (pictures or {}).items():
             save(draw(), staged / file)
-        for file, page in pages.items():
+        for file, page in (pages or {}).items():
             written(page(), staged, file)
         more(staged)
         write_json(staged / name, answer)

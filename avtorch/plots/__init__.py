@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from avtorch.plots.drive import diagnosis_figure
-    from avtorch.plots.paper import PAPER_PICTURES, paper_pictures
+    from avtorch.plots.paper import paper_pictures
     from avtorch.plots.pedals import pedal_figure
     from avtorch.plots.plane import gain_curve, region, region_figure, stability_figure, verdict_legend
-    from avtorch.plots.posteriors import VALIDATION_PICTURES, marginals, validation_figures
+    from avtorch.plots.posteriors import marginals, validation_figures
     from avtorch.plots.ratios import ratio_figure
     from avtorch.plots.signatures import effect_signature, signature_figure
     from avtorch.plots.style import STYLE, save, show
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 _HOME = {
     "drive": "diagnosis_figure",
-    "paper": "PAPER_PICTURES paper_pictures",
+    "paper": "paper_pictures",
     "pedals": "pedal_figure",
     "plane": "gain_curve region region_figure stability_figure verdict_legend",
-    "posteriors": "VALIDATION_PICTURES marginals validation_figures",
+    "posteriors": "marginals validation_figures",
     "ratios": "ratio_figure",
     "signatures": "effect_signature signature_figure",
     "style": "STYLE save show",
@@ -41,9 +41,7 @@ _HOME = {
 _MODULE_OF = {name: f"avtorch.plots.{home}" for home, names in _HOME.items() for name in names.split()}
 
 __all__ = [
-    "PAPER_PICTURES",
     "STYLE",
-    "VALIDATION_PICTURES",
     "belief_figure",
     "diagnosis_figure",
     "effect_signature",

@@ -387,8 +387,6 @@ def place(index: Tensor, window: int) -> int | None:
 
 _COLOURS = {"SGLD": BLUE, "NUTS": VERMILLION, "exact": EXACT}
 METHOD = {"nuts": "NUTS", "quadrature": "quadrature"}
-VALIDATION_PICTURES = ("marginals.png", "joint.png", "agreement.png", "ecdf.png")
-"""Every file that `validation_figures` may name."""
 
 
 def validation_figures(validation: Validation) -> dict[str, Callable[[], Figure]]:
