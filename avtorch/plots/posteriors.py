@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from numpy.typing import ArrayLike
-from scipy.stats import gaussian_kde, uniform
+from scipy.stats import uniform
 from torch import Tensor
 
 from avtorch.arrays import FloatArray
@@ -30,13 +30,9 @@ from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE, sampling_
 from avtorch.validation.validate import Validation
 
 EXACT, EXACT_FILL = "#555555", "#DADADA"
-#: Points of a cloud at most; draws from which the contours of a reference are smoothed, and nodes an axis on which they
-#: are followed.
-SHOWN, KERNELS, MESH = 1500, 4000, 90
-CONTOURS: dict[str, Any] = {
-    "exact": {"color": BLACK, "linestyle": "-", "linewidth": 1.4},
-    "NUTS": {"color": VERMILLION, "linestyle": "--", "linewidth": 1.4},
-}
+_COLOURS = {"SGLD": BLUE, "NUTS": VERMILLION, "exact": EXACT}
+#: Points of a cloud at most.
+SHOWN = 1500
 TAIL = 5e-4
 #: Most bins of a histogram.
 BINS = 2000
@@ -117,45 +113,17 @@ def exact_density(quadrature: Quadrature, name: str, window: int = 0) -> tuple[n
     return z.exp().numpy(), (per_log.clamp_min(0.0) / z.exp()).numpy()
 
 
-def joint_cloud(
-    ax: Axes,
-    posterior: Posterior,
-    window: int = 0,
-    *,
-    references: Mapping[str, tuple[Posterior, int]] | None = None,
-    truth: tuple[float, float] | None = None,
-) -> Axes:
-    """Draws of T_L and K_L as a cloud, and the smallest regions that hold 50 and 90 % of each reference's draws.
-
-    The shares of the cloud within the regions of the first reference are written as the title; they are 50 and 90 %
-    where the two agree.
-
-    Args:
-        posterior: the posterior under test, drawn as points.
-        references: draws for the contours and which of their windows, by method: ``"exact"``, ``"NUTS"``.
-    """
-    cloud = _pair(posterior, window)
-    ax.plot(*evenly(cloud, SHOWN).T, ".", color=BLUE, markersize=2.5, alpha=0.4, rasterized=True)
-    ax.plot([], [], ".", color=BLUE, markersize=8, label="SGLD")
-    spread = [cloud]
-    for number, (method, (reference, own)) in enumerate((references or {}).items()):
-        drawn = evenly(_pair(reference, own), KERNELS)
-        spread.append(drawn)
-        kernel, levels = _regions(np.log(drawn))
-        axes = [np.linspace(*_widened(np.log(drawn[:, k])), MESH) for k in (0, 1)]
-        mesh = kernel(np.stack(np.meshgrid(*axes)).reshape(2, -1)).reshape(MESH, MESH)
-        look = CONTOURS.get(method, CONTOURS["exact"])
-        ax.contour(*np.exp(axes), mesh, levels=sorted(levels), zorder=3 + number,
-                   colors=look["color"], linestyles=look["linestyle"], linewidths=look["linewidth"])  # fmt: skip
-        ax.plot([], [], label=f"{method}, 50 and 90 % regions", **look)
-        if number == 0 and len(cloud):
-            at_cloud = kernel(np.log(evenly(cloud, 2 * KERNELS)).T)
-            inside = [100 * float((at_cloud >= level).mean()) for level in levels]
-            ax.set_title(f"SGLD inside: {inside[0]:.0f} and {inside[1]:.0f} %", loc="left")
+def joint_cloud(ax: Axes, clouds: Mapping[str, FloatArray], *, truth: tuple[float, float] | None = None) -> Axes:
+    """Draws of T_L and K_L (draw, 2) by method, ``"exact"``, ``"SGLD"`` or ``"NUTS"``, those that are finite."""
+    clouds = {method: draws[np.isfinite(draws).all(-1)] for method, draws in clouds.items()}
+    for method, draws in clouds.items():
+        colour = _COLOURS[method]
+        ax.plot(*evenly(draws, SHOWN).T, ".", color=colour, markersize=2.5, alpha=0.4, rasterized=True)
+        ax.plot([], [], ".", color=colour, markersize=8, label=method)
     if truth is not None:
-        ax.plot(*truth, "P", color=BLACK, markersize=9, markeredgecolor="white", label="truth", linestyle="none",
-                zorder=6)  # fmt: skip
-    both = np.concatenate(spread)
+        look: Any = {"color": BLACK, "markersize": 9, "markeredgecolor": "white", "linestyle": "none", "zorder": 6}
+        ax.plot(*truth, "P", label="truth", **look)
+    both = np.concatenate([*clouds.values(), *([] if truth is None else [np.array([truth])])])
     for k, limit in ((0, ax.set_xlim), (1, ax.set_ylim)) if len(both) else ():
         low, high = np.quantile(both[:, k], [0.001, 0.999])
         ends = [low, high] if truth is None else [min(low, truth[k]), max(high, truth[k])]
@@ -248,28 +216,6 @@ def _percent_axis(ax: Axes, x: np.ndarray) -> None:
         ax.xaxis.set_major_locator(MaxNLocator(5))
 
 
-def _pair(posterior: Posterior, window: int) -> np.ndarray:
-    """Finite draws of T_L and K_L, ``(draw, 2)``."""
-    columns = [posterior[name][..., window].flatten() for name in ("T_L", "K_L")]
-    both = torch.stack(columns, -1)
-    return both[both.isfinite().all(-1)].numpy()
-
-
-def _regions(draws: np.ndarray) -> tuple[gaussian_kde, tuple[float, float]]:
-    """A smooth density of draws ``(draw, 2)``, and its heights around 50 and 90 % of them."""
-    kernel = gaussian_kde(draws.T)
-    # leave one out: under its own kernel a draw's density would be too high
-    own = 1 / (2 * np.pi * np.sqrt(np.linalg.det(kernel.covariance)))
-    others = (len(draws) * kernel(draws.T) - own) / (len(draws) - 1)
-    fifty, ninety = np.quantile(others, [0.5, 0.1])
-    return kernel, (float(fifty), float(ninety))
-
-
-def _widened(values: np.ndarray, share: float = 0.15) -> tuple[float, float]:
-    pad = share * float(np.ptp(values))
-    return float(values.min()) - pad, float(values.max()) + pad
-
-
 def _edges(values: np.ndarray, width: float) -> np.ndarray:
     """Edges of bins of about that width; what lies far from nearly all the values shares one wide bin a side."""
     low, high = np.quantile(values, [0.05, 0.95])
@@ -281,7 +227,7 @@ def _edges(values: np.ndarray, width: float) -> np.ndarray:
 
 
 # pictures of a validation -------------------------------------------------------------------------------------------
-#: Exact draws a window, for contours.
+#: Exact draws a window.
 EXACT_DRAWS = 4000
 #: Draws whose exact probabilities are shown, at most.
 MOST = 1000
@@ -385,7 +331,6 @@ def place(index: Tensor, window: int) -> int | None:
     return int(found[0]) if len(found) else None
 
 
-_COLOURS = {"SGLD": BLUE, "NUTS": VERMILLION, "exact": EXACT}
 METHOD = {"nuts": "NUTS", "quadrature": "quadrature"}
 
 
@@ -432,17 +377,15 @@ def marginals_figure(chosen: ChosenWindows) -> Figure:
 
 @styled
 def joint_figure(chosen: ChosenWindows) -> Figure:
-    """Clouds of lag and gain within the 50 and 90 % regions of exact draws and of NUTS; a panel a window."""
+    """Clouds of lag and gain by SGLD, by NUTS and exact; a panel a window."""
     found = chosen.validation
     figure, axes = _panels(1, len(chosen.windows), (3.9, 3.7))
+    pair = [found.names.index(name) for name in ("T_L", "K_L")]
     for i, (window, ax) in enumerate(zip(chosen.windows, axes[0], strict=True)):
-        references = {} if chosen.exact is None else {"exact": (chosen.exact, i)}
-        if window.nuts is not None:
-            references["NUTS"] = (found.nuts, window.nuts)
         lag, gain = chosen.truth(window, "T_L"), chosen.truth(window, "K_L")
         truth = None if lag is None or gain is None else (lag, gain)
-        joint_cloud(ax, found.sgld, window.number, references=references, truth=truth)
-        ax.set_title("\n".join(t for t in (window.title, ax.get_title("left")) if t))
+        joint_cloud(ax, {method: draws[:, pair].numpy() for method, draws in chosen.draws(i).items()}, truth=truth)
+        ax.set_title(window.title)
         if i:
             ax.set_ylabel("")
     _legend(figure, axes)
