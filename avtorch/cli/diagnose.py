@@ -230,17 +230,18 @@ def diagnose(
         next_experiment=None if ahead is None else ahead.to_dict(),
     )
     with answer_set(out, DIAGNOSIS_FILES) as staged:
-        pedals = None if fit is None else fit.map
-        written = [*found.write(staged), *write_table(ahead, staged)]
-        written += write_exports(found.plant, staged, pedals=pedals)
-        written.append(write_report(found, staged, quality=quality, experiment=ahead, origin=origin))
-        written += write_credibility(found, staged, quality=quality, origin=origin) if credibility else []
-        written += write_pedals(fit, staged)
+        found.write(staged)
+        write_table(ahead, staged)
+        write_exports(found.plant, staged, pedals=None if fit is None else fit.map)
+        write_report(found, staged, quality=quality, experiment=ahead, origin=origin)
+        if credibility:
+            write_credibility(found, staged, quality=quality, origin=origin)
+        write_pedals(fit, staged)
     if open_page:
         talk.show(out / PAGE)
     if not talk.json:
         print_diagnosis(talk, found, verbose=verbose)
-    talk.done(out, found.to_dict(), files=[p.name for p in written])
+    talk.done(out, found.to_dict())
 
 
 def _follow(talk: Talk, given: Mapping[str, Any], effects: Sequence[str] | None) -> None:
@@ -265,16 +266,17 @@ def _follow(talk: Talk, given: Mapping[str, Any], effects: Sequence[str] | None)
     lines = found.sentences()
     answer = replace(found, diagnosis=gap).to_dict()
     with answer_set(out, DIAGNOSIS_FILES) as staged:
-        written = [*gap.write(staged), *write_exports(gap.plant, staged)]
+        gap.write(staged)
+        write_exports(gap.plant, staged)
         write_json(staged / "diagnosis.json", answer)
-        written.append(write_report(gap, staged, quality=noted, sections={"The loop": lines}, origin=origin))
+        write_report(gap, staged, quality=noted, sections={"The loop": lines}, origin=origin)
     if not talk.json:
         talk.lines(lines)
         talk.line("")
         talk.table(_loop_table(found.parameters))
         talk.line("Conditional on that law, on the held-out half of the drive:")
         print_diagnosis(talk, gap, verbose=verbose)
-    talk.done(out, answer, files=[p.name for p in written])
+    talk.done(out, answer)
 
 
 def _loop_table(parameters: Mapping[str, Any]) -> Table:
