@@ -37,12 +37,6 @@ if TYPE_CHECKING:
 _PARTS = 12  # of the drive, rows of its table
 _ALARMS = 6  # named in the words below a picture
 _LEAST = 100  # rows of residuals from which there is something to see
-_NOT_COUNTED = {
-    "driver": "grey, the driver's hand",
-    "standstill": "hatched upwards, standstill",
-    "gap": "hatched downwards, no rows",
-    "settling": "pale, the first seconds of a drive and after a return",
-}
 _METHOD = (
     "Each hypothesis is a whole simulator and recorder, rolled out over the drive from the logged commands. Its errors "
     "are compared in short frames and bands of frequency, in each of which the noise is free. The probabilities come "
@@ -253,12 +247,7 @@ def _fit(found: Diagnosis) -> str:
 def _marked(axis: drive.DriveTime) -> str:
     told = []
     if axis.uncounted:
-        each = [
-            f"{words} {sum(x.end - x.begin for x in axis.uncounted if x.why == why):.0f} s"
-            for why, words in _NOT_COUNTED.items()
-            if any(x.why == why for x in axis.uncounted)
-        ]
-        told.append(f" Shaded: what did not count ({'; '.join(each)}).")
+        told.append(f" Shaded: {sum(x.end - x.begin for x in axis.uncounted):.0f} s that did not count.")
     if len(axis.begins) > 1:
         told.append(f" {len(axis.begins)} logs, one behind the other.")
     if axis.onset is not None:
