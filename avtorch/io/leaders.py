@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -137,7 +137,7 @@ def _recorded(names: Iterable[str]) -> set[str]:
     return {name for name in names if _RECORDED.fullmatch(name)}
 
 
-def _refuse_idle(source: str, options: dict[str, object], *takes: str) -> None:
+def _refuse_idle(source: str, options: Mapping[str, object], *takes: str) -> None:
     for option, value in options.items():
         if value is not None and option not in takes:
             argument = f"{option} {value}" if isinstance(value, (int, float)) else option

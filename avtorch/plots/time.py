@@ -264,7 +264,7 @@ def probability_figure(answer: Mapping[str, Any]) -> Figure:
         1
     """
     answer = _from_start(answer)
-    actions = answer.get("actions") or ()
+    actions: Sequence[Mapping[str, Any]] = answer.get("actions") or ()
     figure, (ax,) = _stack(answer, 1, 3.6)
     string_probability(ax, answer["windows"], actions=actions)
     for i, action in enumerate(actions):
