@@ -119,7 +119,7 @@ class Log(Displayed):
                     f"{place(path)}: time is mapped to {named}; channels of a recording have clocks of their own"
                 )
             columns = {signal: mapping.column.get(signal, signal) for signal in SIGNALS if signal != "time"}
-            recorded, arrived = merged(open_recording(path), columns)
+            recorded, arrived = merged(open_recording(path, columns.values()), columns)
             return cls._of(recorded, mapping, following=following, arrived=arrived)
         wanted = {mapping.column.get(signal, signal) for signal in SIGNALS} | set(mapping.stamp.values())
         table = read_table(path, wanted=lambda names: wanted)
