@@ -32,9 +32,7 @@ def main() -> None:
         told, content = answered(reader.open_file(sys.argv[2], kind), json.load(sys.stdin))
     except InputError as fault:
         told, content = {"error": str(fault)}, b""
-    answer(out, told | {"bytes": len(content)})
-    out.write(content)
-    out.flush()
+    answer(out, told | {"bytes": len(content)}, content)
 
 
 def answered(opened: Any, names: list[str]) -> tuple[dict[str, Any], bytes]:
