@@ -17,23 +17,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from avtorch.plots.diagnosis import ratio_figure
     from avtorch.plots.drive import diagnosis_figure
     from avtorch.plots.paper import paper_pictures
     from avtorch.plots.pedals import pedal_figure
     from avtorch.plots.plane import gain_curve, region, region_figure, stability_figure, verdict_legend
     from avtorch.plots.posteriors import marginals, validation_figures
-    from avtorch.plots.ratios import ratio_figure
     from avtorch.plots.signatures import effect_signature, signature_figure
     from avtorch.plots.style import STYLE, save, show
     from avtorch.plots.time import belief_figure, motion_figure, overview_figure, probability_figure
 
 _HOME = {
+    "diagnosis": "ratio_figure",
     "drive": "diagnosis_figure",
     "paper": "paper_pictures",
     "pedals": "pedal_figure",
     "plane": "gain_curve region region_figure stability_figure verdict_legend",
     "posteriors": "marginals validation_figures",
-    "ratios": "ratio_figure",
     "signatures": "effect_signature signature_figure",
     "style": "STYLE save show",
     "time": "belief_figure motion_figure overview_figure probability_figure",

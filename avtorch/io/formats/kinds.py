@@ -105,14 +105,10 @@ def is_recording(path: str | os.PathLike[str]) -> bool:
 
     False for CSV, Parquet, and where there is no such file. Reads at most 4096 bytes and loads no library.
     """
-    file = Path(path)
     try:
         return kind_at(path) is not None
     except InputError:
-        try:
-            return _by_suffix(file) is not None and file.is_file()
-        except OSError:  # a name that no file can have
-            return False
+        return _by_suffix(Path(path)) is not None and os.path.isfile(path)
 
 
 def _by_suffix(file: Path) -> Kind | None:
