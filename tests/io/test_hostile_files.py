@@ -179,7 +179,7 @@ TEXTS = {
     "row": (HEAD.encode() + b'"\n",' * 400_000, "a row has more than 1,000,000 characters"),
     "cell": (HEAD.encode() + b"0,0," + b"9" * 10_000_000, "a row has more than 1,000,000 characters"),
     "quoted_cell": (HEAD.encode() + b'0,0,"' + b"9" * 500_000 + b'"', "line 2: cannot be split into cells"),
-    "returns": (b"time,accel_cmd,speed\r0,1,2\r0.1,\0,2\r", "line 3: holds a zero byte"),
+    "returns": (b"time,accel_cmd,speed\r0,1,2\r0.1,\0,2\r", "is no text"),
 }
 
 
