@@ -46,7 +46,7 @@ def read_leader(path: str | os.PathLike[str], *, vehicle: int | None = None, eve
     Raises InputError for a file of no known form, a vehicle or event that is not in it, an option that does not
     apply, and bad values.
     """
-    table = read_table(path, wanted=_recorded)
+    table = read_table(path, wanted=_RECORDED)
     names = set(table.names)
     options = {"vehicle": vehicle, "event": event}
     stem = Path(table.source).stem
@@ -100,7 +100,7 @@ def read_following(
         >>> log.accel_cmd is None, log.rows
         (True, 200)
     """
-    table = read_table(path, wanted=_recorded)
+    table = read_table(path, wanted=_RECORDED)
     names = set(table.names)
     options = {"vehicle": vehicle, "event": event, "map": map or None, "unit": unit or None, "stamp": stamp or None}
     stem = Path(table.source).stem
@@ -130,11 +130,6 @@ _RECORDED = re.compile(
     r"|Time|Velocity|SpaceGap|RelativeVelocity"  # I-24
     r"|event|time|speed|spacing|lead_speed"  # NGSIM, and plain ones
 )
-
-
-def _recorded(names: Iterable[str]) -> set[str]:
-    """Those of a file's columns that a known form has."""
-    return {name for name in names if _RECORDED.fullmatch(name)}
 
 
 def _refuse_idle(source: str, options: Mapping[str, object], *takes: str) -> None:

@@ -122,7 +122,7 @@ class Log(Displayed):
             recorded, arrived = merged(open_recording(path, columns.values()), columns)
             return cls._of(recorded, mapping, following=following, arrived=arrived)
         wanted = {mapping.column.get(signal, signal) for signal in SIGNALS} | set(mapping.stamp.values())
-        table = read_table(path, wanted=lambda names: wanted)
+        table = read_table(path, wanted=wanted)
         return cls._of(table, mapping, following=following)
 
     @classmethod

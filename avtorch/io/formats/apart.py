@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,9 @@ from avtorch.errors import InputError
 from avtorch.io.formats.kinds import PARQUET, Kind
 from avtorch.io.formats.listed import Channel, Recording
 from avtorch.io.opening import place
+
+Wanted = Collection[str] | re.Pattern[str] | None
+"""Channels or columns to read, by their names or by what these match; None: all."""
 
 MOST_SECONDS, SECONDS_PER_MIB = 60.0, 1.0
 """For each request, by the size of the file: a workbook of 20 million cells takes a third of that."""
@@ -41,18 +45,15 @@ def open_apart(path: str | os.PathLike[str], kind: Kind, names: Collection[str] 
     return Recording(place(path), listing["form"], listing["names"], listing["units"], listing["remarks"], load)
 
 
-def parquet_apart(
-    path: str | os.PathLike[str], wanted: Callable[[tuple[str, ...]], Collection[str]] | None
-) -> tuple[tuple[str, ...], Any]:
-    """The names of all columns of a Parquet file, and the `wanted` ones (default: all) as an Arrow table.
+def parquet_apart(path: str | os.PathLike[str], wanted: Wanted) -> tuple[tuple[str, ...], Any]:
+    """The names of all columns of a Parquet file, and the `wanted` ones as an Arrow table.
 
-    Raises InputError, also where a process that reads it ends or takes too long.
+    Raises InputError, also where the process that reads it ends or takes too long.
     """
     import pyarrow as pa
 
-    names = tuple(_asked(path, PARQUET, ())[0]["names"])
-    _, stream = _asked(path, PARQUET, names if wanted is None else wanted(names))
-    return names, pa.ipc.open_stream(stream).read_all()
+    listing, stream = _asked(path, PARQUET, wanted)
+    return tuple(listing["names"]), pa.ipc.open_stream(stream).read_all()
 
 
 def _channels(listing: dict[str, Any], numbers: memoryview) -> dict[str, Channel]:
@@ -64,8 +65,9 @@ def _channels(listing: dict[str, Any], numbers: memoryview) -> dict[str, Channel
     return {name: Channel(name, arrays[k], x) for (name, k), x in zip(listing["channels"], values, strict=False)}
 
 
-def _asked(path: str | os.PathLike[str], kind: Kind, names: Collection[str]) -> tuple[dict[str, Any], memoryview]:
-    """What a process says of a file, a line of JSON, and the bytes of `names` behind it."""
+def _asked(path: str | os.PathLike[str], kind: Kind, wanted: Wanted) -> tuple[dict[str, Any], memoryview]:
+    """What a process says of a file, a line of JSON, and the bytes of what is `wanted` behind it."""
+    asked = wanted.pattern if isinstance(wanted, re.Pattern) else None if wanted is None else list(wanted)
     source, seconds = place(path), MOST_SECONDS + SECONDS_PER_MIB * _size(path) / 2**20
     # -P: nothing of the folder that the user happens to work in
     command = [sys.executable or "python", "-P", "-W", "ignore", "-m", "avtorch.io.formats.apart_process"]
@@ -75,7 +77,7 @@ def _asked(path: str | os.PathLike[str], kind: Kind, names: Collection[str]) -> 
     try:
         done = subprocess.run(
             [*command, kind.words, os.fspath(path)],
-            input=json.dumps(list(names)).encode(),
+            input=json.dumps(asked).encode(),
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env=environment,

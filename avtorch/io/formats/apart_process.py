@@ -1,14 +1,15 @@
 """The process in which a reader runs apart: it opens one recording, and answers what it has and what is asked for.
 
-Arguments are the name of the format and the path; the standard input is a list of names in JSON. The answer is a line
-of JSON, then the numbers: the clocks, then the values of the channels; of a Parquet file its columns as an Arrow
-stream.
+Arguments are the name of the format and the path; the standard input is JSON: names, what they match, or null for all.
+The answer is a line of JSON, then the numbers: the clocks, then the values of the channels; of a Parquet file its
+columns as an Arrow stream.
 """
 
 from __future__ import annotations
 
 import importlib
 import json
+import re
 import sys
 from typing import Any
 
@@ -35,11 +36,13 @@ def main() -> None:
     answer(out, told | {"bytes": len(content)}, content)
 
 
-def answered(opened: Any, names: list[str]) -> tuple[dict[str, Any], bytes]:
-    """What an opened file has, and the bytes of those of `names` that it has."""
-    there = [name for name in names if name in opened.names]
+def answered(opened: Any, wanted: list[str] | str | None) -> tuple[dict[str, Any], bytes]:
+    """What an opened file has, and the bytes of what is `wanted` of it: of names, of what these match, or of all."""
+    if isinstance(wanted, str):
+        wanted = [name for name in opened.names if re.fullmatch(wanted, name)]
+    there = list(opened.names if wanted is None else [name for name in wanted if name in opened.names])
     if hasattr(opened, "stream"):
-        return {"names": opened.names}, opened.stream(there) if there else b""
+        return {"names": opened.names}, opened.stream(there)
     channels = list(opened.read(there).values())
     clocks = {id(channel.time): channel.time for channel in channels}
     place = {key: k for k, key in enumerate(clocks)}
