@@ -1,18 +1,14 @@
 """The other side of a pipe, for what runs in a process of its own: answers, and a limit of memory.
 
-An answer is a line of JSON, then the numbers that it tells of. It imports nothing that takes time to load.
+An answer is a line of JSON, and what it tells of behind it. It imports nothing that takes time to load.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, BinaryIO
-
-import numpy as np
-
-from avtorch.arrays import FloatArray
 
 
 def answers_to() -> BinaryIO:
@@ -22,11 +18,9 @@ def answers_to() -> BinaryIO:
     return out
 
 
-def answer(out: BinaryIO, what: Mapping[str, Any], arrays: Iterable[FloatArray] = ()) -> None:
-    """Write an answer and its numbers, as float64."""
-    out.write(json.dumps(what).encode() + b"\n")
-    for array in arrays:
-        out.write(np.ascontiguousarray(array, dtype=np.float64).tobytes())
+def answer(out: BinaryIO, what: Mapping[str, Any], content: bytes = b"") -> None:
+    """Write an answer and the `content` behind it."""
+    out.write(json.dumps(what).encode() + b"\n" + content)
     out.flush()
 
 

@@ -158,7 +158,7 @@ def test_run_detects_the_change_and_acts(tmp_path: Path, capsys: pytest.CaptureF
         for key in ("speed_rms_ratio", "accel_rms_ratio", "min_spacing_m", "jerk_rms_mps3", "clipped_share"):
             assert math.isfinite(figures[key])
         assert "min_ttc_s" in figures
-    pictures = {"motion.png", "belief.png", "probability.png", "region.png", "overview.png"}
+    pictures = {"motion.png", "region.png", "overview.png"}
     assert {p.name for p in tmp_path.glob("[!.]*")} == {"run.json", "run.html", *pictures}
 
 
@@ -292,19 +292,19 @@ def test_an_interruption_leaves_the_older_answer_and_its_pictures(
 
     monkeypatch.setattr("avtorch.plots.stability_figure", interrupted)
     assert main([*arguments, "--T", "0.7"]) == 130
-    assert capsys.readouterr().err == "avtorch: interrupted; no answer was written\n"
+    assert capsys.readouterr().err == "avtorch: interrupted\n"
     assert visible(tmp_path) == before
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["estimate"], "LOG: missing; needs a file, see avtorch estimate --help"),
+        (["estimate"], "LOG: missing; see avtorch estimate --help"),
         (
             ["compare", "before.csv"],
             "AFTER: missing; needs a file, or two of --simulator and --simulated, see avtorch compare --help",
         ),
-        (["run"], "--out: missing; needs a folder for the answer and the pictures, such as --out out/run"),
+        (["run"], "--out: missing; see avtorch run --help"),
     ],
     ids=lambda x: x[0] if isinstance(x, list) else "",
 )

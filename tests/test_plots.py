@@ -177,10 +177,10 @@ def test_figures_are_written_whole(tmp_path: Path, cloud: int) -> None:
 def test_the_other_figures() -> None:
     figures = [
         plots.motion_figure(ANSWER, TIME, TRACES),
-        plots.belief_figure(WINDOWS, answer=ANSWER, truth=TRUTH, bounds={"T_L": (0.1, 0.4), "K_L": (0.7, 1.0)}),
-        plots.belief_figure(WINDOWS, log=log()),
-        plots.probability_figure(WINDOWS, answer=ANSWER),
-        plots.overview_figure(ANSWER, TIME, TRACES, truth=TRUTH),
+        plots.belief_figure(ANSWER, truth=TRUTH),
+        plots.belief_figure({"windows": WINDOWS}, log=log()),
+        plots.probability_figure(ANSWER),
+        plots.overview_figure(ANSWER, TIME, TRACES, truth=TRUTH, bounds={"T_L": (0.1, 0.4), "K_L": (0.7, 1.0)}),
     ]
     for figure in figures:
         figure.canvas.draw()
@@ -192,7 +192,7 @@ def test_the_other_figures() -> None:
 
 def test_style_of_the_reader_is_left_alone() -> None:
     before = dict(mpl.rcParams)
-    plots.probability_figure(WINDOWS)
+    plots.probability_figure({"windows": WINDOWS})
     assert dict(mpl.rcParams) == before
 
 
@@ -240,7 +240,7 @@ def test_an_alarm_that_goes_on_is_marked_where_it_begins_and_where_it_is_acted_u
     windows = [{**window(t), "alerts": ["stability"]} for t in (0.0, 2.0, 4.0)]
     alerts = [{"time_s": w["end_s"], "detector": "stability", "why": "x"} for w in windows]
     actions = [{"time_s": 6.0, "strategies": [1], "settings": SETTING}]
-    figure = plots.probability_figure(windows, answer={"windows": windows, "alerts": alerts, "actions": actions})
+    figure = plots.probability_figure({"windows": windows, "alerts": alerts, "actions": actions})
     wide = [line for line in figure.axes[0].lines if line.get_linewidth() == 5]
     assert [line.get_xdata()[0] for line in wide] == [2.0, 6.0]
 
@@ -249,7 +249,7 @@ def test_a_second_detector_is_marked_while_the_first_goes_on() -> None:
     windows = [{**window(t), "alerts": ["accepted_change"]} for t in (0.0, 2.0, 4.0)]
     windows[2]["alerts"] = ["stability", "accepted_change"]
     alerts = [{"time_s": w["end_s"], "detector": name, "why": "x"} for w in windows for name in w["alerts"]]
-    figure = plots.probability_figure(windows, answer={"windows": windows, "alerts": alerts})
+    figure = plots.probability_figure({"windows": windows, "alerts": alerts})
     wide = [line for line in figure.axes[0].lines if line.get_linewidth() == 5]
     assert [line.get_xdata()[0] for line in wide] == [2.0, 6.0]
 

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 from cyclopts import App, CoercionError, CycloptsError, MissingArgumentError, Parameter, ValidationError
 
-from avtorch.cli.arguments import COMMAND_LINE, free_folder
+from avtorch.cli.arguments import COMMAND_LINE
 from avtorch.cli.check import check
 from avtorch.cli.compare import compare
 from avtorch.cli.diagnose import diagnose
@@ -57,20 +57,12 @@ def alone_in_out(command: Callable[..., None]) -> Callable[..., None]:
         if out is None:
             return command(*args, **kwargs)
         from avtorch.io import sole_use
-        from avtorch.io.answer_set import published
 
-        free_folder(out)
-        before = len(published)
-        try:
-            with sole_use(out, work=f"avtorch {command.__name__}") as locked:
-                if not locked:
-                    warning = "the file system has no locks; keep other runs out of this folder"
-                    print(f"avtorch: {out}: {warning}", file=sys.stderr)
-                return command(*args, **kwargs)
-        except KeyboardInterrupt as stop:
-            if len(published) > before and not str(stop):
-                raise KeyboardInterrupt(f"the new answer is in {out}") from None
-            raise
+        with sole_use(out, work=f"avtorch {command.__name__}") as locked:
+            if not locked:
+                warning = "the file system has no locks; keep other runs out of this folder"
+                print(f"avtorch: {out}: {warning}", file=sys.stderr)
+            return command(*args, **kwargs)
 
     return held
 
@@ -115,28 +107,16 @@ app.command(workbench, name="app")
 
 
 def _said(fault: CycloptsError) -> str:
-    """Of a value that a check of ours refuses, the option and what it needs; the parser's own message otherwise."""
+    """What is missing, or the option and what it needs; the parser's own message otherwise."""
     argument = fault.argument
-    if isinstance(fault, MissingArgumentError):
-        return _missing(fault)
     if argument is None:
         return str(fault)
+    if isinstance(fault, MissingArgumentError) and not argument.tokens:
+        name = argument.name if argument.index is None else argument.name.lstrip("-").upper()
+        return f"{name}: missing; see avtorch {' '.join(fault.command_chain or ())} --help"
     if isinstance(fault, ValidationError):
         return f"{argument.name}: {fault.exception_message}"
     return f"{argument.name}: {fault.msg}" if isinstance(fault, CoercionError) and fault.msg else str(fault)
-
-
-def _missing(fault: MissingArgumentError) -> str:
-    """Name the missing argument and give an example; the parser only reports that one is missing."""
-    command = " ".join(fault.command_chain or ())
-    argument = fault.argument
-    if argument is None or argument.tokens:
-        return str(fault)
-    if argument.name == "--out":
-        return f"--out: missing; needs a folder for the answer and the pictures, such as --out out/{command}"
-    if argument.index is not None:
-        return f"{argument.name.lstrip('-').upper()}: missing; needs a file, see avtorch {command} --help"
-    return f"{argument.name}: missing; see avtorch {command} --help"
 
 
 def use_one_thread() -> None:
@@ -170,7 +150,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
         print("avtorch: " + printable(" ".join(f"{where}{fault.strerror or fault}".split())), file=sys.stderr)
         return 2
     except KeyboardInterrupt as stop:
-        print(f"avtorch: interrupted; {printable(str(stop)) or 'no answer was written'}", file=sys.stderr)
+        print(printable(": ".join(filter(None, ("avtorch: interrupted", str(stop))))), file=sys.stderr)
         return 130
     finally:
         COMMAND_LINE.reset(given)

@@ -147,22 +147,6 @@ def limits_pair(text: str) -> tuple[float, float]:
     return low, high
 
 
-def free_folder(out: Path) -> None:
-    """Refuse a place that cannot become a folder before any work is done; nothing is made yet."""
-    for place in (out, *out.parents):
-        if place.exists():
-            if not place.is_dir():
-                what = "a file" if place == out else f"inside {place}, which is a file"
-                raise InputError(f"--out: {out} is {what}; needs a folder, or a name that is free")
-            return
-
-
-def folder_without(out: Path, other: str) -> None:
-    """Refuse a folder with an answer whose pictures have the same names as this one's."""
-    if (out / other).exists():
-        raise InputError(f"--out: {out} holds {other}, and pictures of the same names; needs another folder")
-
-
 def origin_of(paths: Sequence[Path], given: Mapping[str, Any]) -> Origin:
     """How an answer is made: by the files as they are now, with a log's mapping file, and by the arguments `given` to
     the command, without paths and what only says how the answer is shown."""

@@ -106,8 +106,7 @@ def compare(
             talk.notes(which.name, which.notes)
 
     from avtorch.io import check
-    from avtorch.report import comparison_html
-    from avtorch.report.comparison import comparison_tables
+    from avtorch.report.comparison import comparison_html, comparison_tables
 
     if out is not None:
         notes = [f"{log.name}: {note}" for log in read for note in check(log).notes]

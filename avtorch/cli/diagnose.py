@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Group
 
 from avtorch.cli import arguments as arg
-from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.simulators import read_simulator, refuse_loop, simulator_of
 from avtorch.cli.talk import Talk
@@ -230,18 +229,19 @@ def diagnose(
         setting=None if setting is None else setting.to_dict(),
         next_experiment=None if ahead is None else ahead.to_dict(),
     )
-    with answer_set(out, (*DIAGNOSIS_FILES, *PEDAL_FILES)) as staged:
-        pedals = None if fit is None else fit.map
-        written = [*found.write(staged), *write_table(ahead, staged)]
-        written += write_exports(found.plant, staged, pedals=pedals)
-        written.append(write_report(found, staged, quality=quality, experiment=ahead, origin=origin))
-        written += write_credibility(found, staged, quality=quality, origin=origin) if credibility else []
-        written += write_pedals(fit, staged)
+    with answer_set(out, DIAGNOSIS_FILES) as staged:
+        found.write(staged)
+        write_table(ahead, staged)
+        write_exports(found.plant, staged, pedals=None if fit is None else fit.map)
+        write_report(found, staged, quality=quality, experiment=ahead, origin=origin)
+        if credibility:
+            write_credibility(found, staged, quality=quality, origin=origin)
+        write_pedals(fit, staged)
     if open_page:
         talk.show(out / PAGE)
     if not talk.json:
         print_diagnosis(talk, found, verbose=verbose)
-    talk.done(out, found.to_dict(), files=[p.name for p in written])
+    talk.done(out, found.to_dict())
 
 
 def _follow(talk: Talk, given: Mapping[str, Any], effects: Sequence[str] | None) -> None:
@@ -265,17 +265,18 @@ def _follow(talk: Talk, given: Mapping[str, Any], effects: Sequence[str] | None)
     gap = replace(gap, notes=(*gap.notes, *found.conditional))
     lines = found.sentences()
     answer = replace(found, diagnosis=gap).to_dict()
-    with answer_set(out, (*DIAGNOSIS_FILES, *PEDAL_FILES)) as staged:
-        written = [*gap.write(staged), *write_exports(gap.plant, staged)]
+    with answer_set(out, DIAGNOSIS_FILES) as staged:
+        gap.write(staged)
+        write_exports(gap.plant, staged)
         write_json(staged / "diagnosis.json", answer)
-        written.append(write_report(gap, staged, quality=noted, sections={"The loop": lines}, origin=origin))
+        write_report(gap, staged, quality=noted, sections={"The loop": lines}, origin=origin)
     if not talk.json:
         talk.lines(lines)
         talk.line("")
         talk.table(_loop_table(found.parameters))
         talk.line("Conditional on that law, on the held-out half of the drive:")
         print_diagnosis(talk, gap, verbose=verbose)
-    talk.done(out, answer, files=[p.name for p in written])
+    talk.done(out, answer)
 
 
 def _loop_table(parameters: Mapping[str, Any]) -> Table:

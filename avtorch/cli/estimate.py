@@ -8,7 +8,6 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from avtorch.cli import arguments as arg
-from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
@@ -61,7 +60,6 @@ def estimate(
     given = dict(locals())
     k = arg.three_gains(gains)
     sound = arg.accepted_pair(accepted)
-    arg.folder_without(out, "run.json")
     if mode != "lambda" and estimator not in PASSING_ON:
         raise InputError(f"--mode: has no meaning with --estimator {estimator}, which passes no prior on; leave it out")
 
@@ -86,21 +84,19 @@ def estimate(
             found = work(drive, window, progress=step, **options)
     except KeyboardInterrupt:
         if (out / STATE).exists():
-            message = (
-                f"no answer was written; finished windows are kept in {out / STATE}: the same command resumes there"
-            )
-            raise KeyboardInterrupt(message) from None
+            kept = f"finished windows are kept in {out / STATE}: the same command resumes there"
+            raise KeyboardInterrupt(kept) from None
         raise
     answer = estimates_answer(found)
     if fit is not None:
         answer["command"] = about_map
 
     from avtorch import plots
-    from avtorch.report import estimates_html
     from avtorch.report.estimates import (
         P_WORDS,
         alert_table,
         dead_time_note,
+        estimates_html,
         estimates_note,
         late_note,
         window_table,
@@ -109,12 +105,12 @@ def estimate(
     origin = arg.origin_of([log], given)
     notes = () if fit is None else (about_map,)
     pictures = {
-        "belief.png": lambda: plots.belief_figure(answer["windows"], answer=answer, log=drive),
-        "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
+        "belief.png": lambda: plots.belief_figure(answer, log=drive),
+        "probability.png": lambda: plots.probability_figure(answer),
     }
     pages = {PAGE: lambda: estimates_html(found, drive, notes=notes, origin=origin)}
     pedals = lambda staged: write_pedals(fit, staged)  # noqa: E731
-    write_answer(out, "estimates.json", answer, pictures, pages, more=pedals, also=PEDAL_FILES)
+    write_answer(out, "estimates.json", answer, pictures, pages, more=pedals)
     if open_page:
         talk.show(out / PAGE)
     printed = answer | {key: from_start(answer[key], answer["epoch_s"]) for key in ("windows", "alerts")}

@@ -92,7 +92,7 @@ def fleet(
 
     page = None
     if reports:
-        from avtorch.report import report_html as page
+        from avtorch.report.diagnosis import report_html as page
 
     settings = FleetSettings(
         steps=steps,

@@ -49,9 +49,9 @@ def paper(
         found = reproduce(None if name == "all" else [name], leaders=leaders, seeds=seeds, seed=seed, progress=step)
     answer = found.answer()
 
-    from avtorch.plots import PAPER_PICTURES, paper_pictures
+    from avtorch.plots import paper_pictures
 
-    write_answer(out, "paper.json", answer, paper_pictures(found.found), also=PAPER_PICTURES)
+    write_answer(out, "paper.json", answer, paper_pictures(found.found))
     talk.notes("Leaders", [f"{name}: {which}" for name, which in answer["leaders"].items()])
     talk.table(counts_table(answer) if name == "all" else rows_table(answer))
     talk.lines(missed(answer))

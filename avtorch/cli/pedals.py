@@ -13,10 +13,6 @@ if TYPE_CHECKING:
     from avtorch.io import Log
     from avtorch.pedals import PedalFit, PedalTable
 
-PICTURE = "pedal_map.png"
-FILES = ("pedal_map.csv", "accel_map.csv", "brake_map.csv", PICTURE)
-"""Every file of a map, named here because `avtorch.pedals` brings SciPy, which a log without pedals does not need."""
-
 
 def commanded(talk: Talk, drives: Sequence[Log]) -> tuple[list[Log], PedalFit | None, str]:
     """The drives with an `accel_cmd`, the fit of the map that made it, and a sentence on it.
@@ -75,17 +71,15 @@ def _range(name: str, knots: FloatArray) -> str:
     return f"{size * low:.3g} to {size * high:.3g} {unit}"
 
 
-def write_pedals(fit: PedalFit | None, staged: Path) -> list[Path]:
-    """Write the map, its tables for other tools and its picture into the folder of an answer set that has `FILES`;
-    returns the files. Without a map none.
+def write_pedals(fit: PedalFit | None, staged: Path) -> None:
+    """Write the map, its tables for other tools and its picture into the folder of an answer set; nothing without one.
 
     Raises `InputError` where that cannot be done.
     """
     if fit is None:
-        return []
+        return
     from avtorch import plots
     from avtorch.pedals import write_map
 
-    written = write_map(fit.map, staged)
-    plots.save(plots.pedal_figure(fit.map), staged / PICTURE)
-    return [*written, staged / PICTURE]
+    write_map(fit.map, staged)
+    plots.save(plots.pedal_figure(fit.map), staged / "pedal_map.png")

@@ -55,7 +55,6 @@ def run(
     """
     given = dict(locals())
     low, high = arg.limits_pair(limits)
-    arg.folder_without(out, "estimates.json")
     if controller == "mpc" and strategy == "3":
         raise InputError("--strategy: found 3 with --controller mpc, needs auto, 1, 2 or none")
     if leader is None and (vehicle is not None or event is not None):
@@ -145,8 +144,7 @@ def _write(
     origin: Origin,
 ) -> None:
     from avtorch import plots
-    from avtorch.report import run_html
-    from avtorch.report.run import Regions
+    from avtorch.report.run import run_html
 
     time, rows = acting.rows.time, acting.rows
     traces: dict[str, dict[str, Any]] = {}
@@ -161,11 +159,9 @@ def _write(
     pictures = {
         "overview.png": lambda: plots.overview_figure(answer, time, traces, truth=truth, bounds=BOUNDS),
         "motion.png": lambda: plots.motion_figure(answer, time, traces),
-        "belief.png": lambda: plots.belief_figure(answer["windows"], answer=answer, truth=truth, bounds=BOUNDS),
-        "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
         "region.png": lambda: plots.region_figure(settings, clouds, truth=vehicle),
     }
-    more: Any = {"truth": truth, "bounds": BOUNDS, "regions": Regions(settings, clouds), "origin": origin}
+    more: Any = {"truth": truth, "bounds": BOUNDS, "regions": (settings, clouds), "origin": origin}
     write_answer(out, "run.json", answer, pictures, {PAGE: lambda: run_html(answer, time, traces, **more)})
 
 

@@ -103,33 +103,14 @@ class Talk:
         if not webbrowser.open(page.absolute().as_uri()):
             self.line(f"No browser was found to open {page}")
 
-    def done(self, out: Path, answer: Mapping[str, Any], *, files: Iterable[str] = ()) -> None:
-        """The answer as JSON, or where its files are: all that a reader opens; or a line each for `files`."""
+    def done(self, out: Path, answer: Mapping[str, Any]) -> None:
+        """The answer as JSON, or where its files are: all that a reader opens."""
         if self.json:
             self.answer(answer)
             return
-        if files:
-            for name in files:
-                says = _FILES.get(name, _FILES.get(Path(name).suffix, ""))
-                self.out.print(f"[bold]{escape(str(out / name))}[/bold]{says and '  '}{says}", soft_wrap=True)
-            return
-        kinds = (".html", ".json", ".png")
+        kinds = (".csv", ".html", ".json", ".md", ".png", ".toml", ".xml", ".yaml")
         there = sorted(p.name for p in out.iterdir() if p.suffix in kinds and p.is_file())
         self.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {escape(', '.join(there))}", soft_wrap=True)
-
-
-_FILES = {
-    "report.html": "to read",
-    "credibility.html": "the evidence for an assessor",
-    "credibility.md": "the same to paste",
-    "plant.toml": "the repaired simulator",
-    "manoeuvre.csv": "what to drive next",
-    ".csv": "the map of the commands",
-    ".json": "all numbers",
-    ".yaml": "in that tool's terms",
-    ".xml": "in that tool's terms",
-}
-"""What a file of a diagnosis holds, by its name or its suffix."""
 
 
 def drawn(table: Table, most: int | None = None) -> Drawn:
@@ -156,19 +137,16 @@ def write_answer(
     pages: Mapping[str, Callable[[], str]] | None = None,
     *,
     more: Callable[[Path], object] = lambda staged: None,
-    also: Sequence[str] = (),
 ) -> None:
-    """Publish the answer, its pictures and its pages as one set; `more` writes further files into it, out of `also`,
-    the files that an earlier answer of this kind may have left."""
+    """Publish the answer, its pictures and its pages as one set; `more` writes further files into it."""
     from avtorch.io import answer_set, write_json
     from avtorch.plots import save
     from avtorch.report.page import written
 
-    pictures, pages = pictures or {}, pages or {}
-    with answer_set(out, list(dict.fromkeys([name, *pictures, *pages, *also]))) as staged:
-        for file, draw in pictures.items():
+    with answer_set(out, [name]) as staged:
+        for file, draw in (pictures or {}).items():
             save(draw(), staged / file)
-        for file, page in pages.items():
+        for file, page in (pages or {}).items():
             written(page(), staged, file)
         more(staged)
         write_json(staged / name, answer)

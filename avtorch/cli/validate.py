@@ -14,9 +14,6 @@ from avtorch.errors import InputError
 if TYPE_CHECKING:
     from arviz import InferenceData
 
-#: NetCDF for ArviZ.
-EXPORTS = ("sgld.nc", "nuts.nc", "quadrature.nc")
-
 PAGE = "validation.html"
 
 #: Synthetic windows if no number is given.
@@ -90,9 +87,8 @@ def validate(
 
     groups = found.to_arviz()
     pages = {PAGE: lambda: validation_html(found, origin=origin)}
-    files = (*plots.VALIDATION_PICTURES, *EXPORTS)
     nets = lambda staged: export(staged, groups)  # noqa: E731
-    write_answer(out, "validation.json", answer, plots.validation_figures(found), pages, more=nets, also=files)
+    write_answer(out, "validation.json", answer, plots.validation_figures(found), pages, more=nets)
     if open_page:
         talk.show(out / PAGE)
     talk.table(validation_table(answer))

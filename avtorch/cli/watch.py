@@ -85,8 +85,6 @@ def watch(
     k = arg.three_gains(gains)
     sound = arg.accepted_pair(accepted)
     address = None if prometheus is None else host_and_port(prometheus)
-    if state is not None:
-        arg.free_folder(state)
 
     from avtorch.live import Counts, KeptCars, LineParser, LiveSettings, LiveWatch, Metrics, watch_source
 

@@ -16,13 +16,13 @@ from avtorch.errors import InputError
 from avtorch.gap.simulator.around import Around
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io.answers import atomic
-from avtorch.io.formats.kinds import Kind, Library, library, refuse_missing
+from avtorch.io.formats.kinds import Kind, library
 from avtorch.io.opening import place
 
 if TYPE_CHECKING:
     from avtorch.gap.result.diagnosis import Diagnosis
 
-_MADE = Kind("to be an FMU", "", Library("pythonfmu", "pythonfmu", "fmu"), (".fmu",), "'PK', as a ZIP file")
+_MADE = Kind("to be an FMU", "", "fmu", (".fmu",), "'PK', as a ZIP file")
 _CAR = {"name": "avtorch_car", "description": "The whole car as avtorch found it"}
 _AROUND = {"name": "avtorch_around", "description": "What a simulator of a car lacks, around that simulator"}
 
@@ -60,7 +60,6 @@ def write_fmu(
         'late.fmu'
     """
     source = place(path)
-    refuse_missing(source, _MADE)
     plant = found if isinstance(found, GapPlant) else found.plant
     if plant is None:
         raise InputError(f"{source}: the diagnosis found no effect, so there is no plant; needs one with a plant")

@@ -13,33 +13,26 @@ Example:
 
 from avtorch.io.answer_set import answer_set, read_answer
 from avtorch.io.answers import atomic, write_json
-from avtorch.io.assemble import held
 from avtorch.io.folder_lock import sole_use
-from avtorch.io.leaders import RawLeader, read_following, read_leader
+from avtorch.io.leaders import read_following, read_leader
 from avtorch.io.log import STANDSTILL_MPS, Log, LogSource, as_log, as_logs
-from avtorch.io.quality import Gap, Quality, check
-from avtorch.io.sealed import Damaged, Sealed, fingerprint, read_sealed, read_sealed_bytes, write_sealed
+from avtorch.io.quality import check
+from avtorch.io.sealed import Damaged, fingerprint, read_sealed_bytes, write_sealed
 
 __all__ = [
     "STANDSTILL_MPS",
     "Damaged",
-    "Gap",
     "Log",
     "LogSource",
-    "Quality",
-    "RawLeader",
-    "Sealed",
     "answer_set",
     "as_log",
     "as_logs",
     "atomic",
     "check",
     "fingerprint",
-    "held",
     "read_answer",
     "read_following",
     "read_leader",
-    "read_sealed",
     "read_sealed_bytes",
     "sole_use",
     "write_json",

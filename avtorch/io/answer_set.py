@@ -32,22 +32,20 @@ _MOST = 2**30  # bytes of an answer's JSON
 _staged: set[Path] = set()
 """Folders that `answer_set` has yielded: an answer written into one of them is added to its set."""
 
-published: list[Path] = []
-"""Folders in which this process has published answers, in order, for the message of a later interruption."""
-
 
 @contextmanager
 def answer_set(folder: str | os.PathLike[str], names: Sequence[str]) -> Iterator[Path]:
     """Yield an empty folder for the files of an answer; they replace the earlier ones in `folder` when the block ends.
 
-    `names`: every file that this answer may consist of, its JSON first. Earlier files of these names that are not
-    written again are removed; all others stay. If the block fails, nothing has changed. If it fails while the files are
-    put in place, each is whole, and `read_answer` refuses the JSON, which comes last.
+    `names`: the answer's JSON, and other files that belong to it. What the earlier JSON lists and what has one of
+    these names is removed where it is not written again; all other files stay. If the block fails, nothing has
+    changed. If it fails while the files are put in place, each is whole, and `read_answer` refuses the JSON, which
+    comes last.
 
     A writer that is called within the block with the yielded folder adds to the same set. No other process can write an
     answer into `folder` meanwhile.
 
-    Raises InputError where `folder` cannot be written or is in use, ValueError for a file that `names` does not have.
+    Raises InputError where `folder` cannot be written or is in use.
     """
     place = Path(folder)
     if place in _staged:
@@ -61,10 +59,9 @@ def answer_set(folder: str | os.PathLike[str], names: Sequence[str]) -> Iterator
             staged = Path(tempfile.mkdtemp(prefix=_STAGE, dir=place))
             _staged.add(staged)
             yield staged
-            files = _prepared(place, staged, names)
+            files = _prepared(place, staged, names[0])
             begun = True
             _put_in_place(place, staged, files, names)
-            published.append(place)
         except BaseException as fault:
             left = f"files of two answers lie in {place} until it is written again"
             if isinstance(fault, OSError):
@@ -117,11 +114,17 @@ def read_answer(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def is_of_answer(path: Path, answer: str) -> bool:
     """Whether the JSON `answer` beside the file `path` lists that file."""
+    return path.name in _listed(path.parent / answer)
+
+
+def _listed(answer: Path) -> list[str]:
+    """The files that an answer's JSON lists; none where there is no such JSON."""
     try:
-        listed = json.loads((path.parent / answer).read_text(encoding="utf-8"))[FILES]
+        listed = list(json.loads(answer.read_text(encoding="utf-8"))[FILES])
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
-        return False
-    return isinstance(listed, dict) and path.name in listed
+        return []
+    own = [name for name in listed if isinstance(name, str) and Path(name).name == name]
+    return [name for name in own if not (answer.parent / name).is_dir()]
 
 
 def _digest(path: Path) -> str | None:
@@ -132,15 +135,13 @@ def _digest(path: Path) -> str | None:
         return None
 
 
-def _prepared(place: Path, staged: Path, names: Sequence[str]) -> list[str]:
+def _prepared(place: Path, staged: Path, main: str) -> list[str]:
     """The names of the files that were written, on the disk and with their hashes in the JSON; nothing is in place."""
     files = sorted(os.listdir(staged))
-    if foreign := set(files) - set(names):
-        raise ValueError(f"{place}: {', '.join(sorted(foreign))} written, needs names out of {', '.join(names)}")
-    for name in names:
+    for name in (main, *files):
         if (place / name).is_dir() and not (place / name).is_symlink():
             raise InputError(f"{place / name}: is a directory; the name of a file is needed")
-    main, others = names[0], [name for name in files if name != names[0]]
+    others = [name for name in files if name != main]
     if main in files and main.endswith(".json") and others:
         answer = json.loads((staged / main).read_text(encoding="utf-8"))
         write_json(staged / main, answer | {FILES: {name: _digest(staged / name) for name in others}})
@@ -151,7 +152,7 @@ def _prepared(place: Path, staged: Path, names: Sequence[str]) -> list[str]:
 
 
 def _put_in_place(place: Path, staged: Path, files: Sequence[str], names: Sequence[str]) -> None:
-    main, *others = names
+    main, *others = dict.fromkeys((*names, *_listed(place / names[0]), *files))
     for name in (*others, main):
         if name in files:
             os.replace(staged / name, place / name)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError, listed
@@ -39,19 +38,17 @@ class RawLeader:
     note: str = ""
 
 
-def read_leader(
-    path: str | os.PathLike[str], *, vehicle: int | None = None, event: int | None = None, duration: float | None = None
-) -> RawLeader:
+def read_leader(path: str | os.PathLike[str], *, vehicle: int | None = None, event: int | None = None) -> RawLeader:
     """Read a leader from OpenACC (AstaZero or ZalaZONE form), NGSIM, I-24, or a plain CSV or Parquet of time and speed.
 
-    ``vehicle`` is the file's own number (OpenACC; default: the lowest). ``event`` is the NGSIM event; without it events
-    are joined at equal speed until they last ``duration`` [s] (default 80). A recording is cut to its longest stretch
-    without empty speeds or steps over 1.5 s; ``note`` records the cut. Raises InputError for a file of no known form, a
-    vehicle or event that is not in it, an option that does not apply, and bad values.
+    ``vehicle`` is the file's own number (OpenACC; default: the lowest), ``event`` that of NGSIM (default: the longest).
+    A recording is cut to its longest stretch without empty speeds or steps over 1.5 s; ``note`` records the cut.
+    Raises InputError for a file of no known form, a vehicle or event that is not in it, an option that does not
+    apply, and bad values.
     """
-    table = read_table(path, wanted=_recorded)
+    table = read_table(path, wanted=_RECORDED)
     names = set(table.names)
-    options = {"vehicle": vehicle, "event": event, "duration": duration}
+    options = {"vehicle": vehicle, "event": event}
     stem = Path(table.source).stem
     if platoon := _platoon(names):
         _refuse_idle(table.source, options, "vehicle")
@@ -61,10 +58,9 @@ def read_leader(
             raise InputError(f"{table.source}: vehicle {own} is not in it; vehicles: {listed(map(str, there))}")
         return _leader(table, "Time", f"{platoon}{own}", name=f"{stem}, vehicle {own}")
     if {"event", "time", "lead_speed"} <= names:
-        _refuse_idle(table.source, options, "event", "duration")
-        if event is None:
-            return _joined(table, DURATION_S if duration is None else float(duration))
-        return _event_leader(table, event, _rows_of(table, event))
+        _refuse_idle(table.source, options, "event")
+        number, rows = _event(table, event)
+        return _leader(table, "time", "lead_speed", name=f"NGSIM {number}", rows=rows, note=f"event {number}")
     _refuse_idle(table.source, options)
     if {"Time", "Velocity"} <= names:
         return _leader(table, "Time", "Velocity", name=stem)
@@ -104,7 +100,7 @@ def read_following(
         >>> log.accel_cmd is None, log.rows
         (True, 200)
     """
-    table = read_table(path, wanted=_recorded)
+    table = read_table(path, wanted=_RECORDED)
     names = set(table.names)
     options = {"vehicle": vehicle, "event": event, "map": map or None, "unit": unit or None, "stamp": stamp or None}
     stem = Path(table.source).stem
@@ -122,9 +118,9 @@ def read_following(
         return _whole(stem, table.numbers("Time"), speed / 3.6, gap, speed / 3.6 + faster)
     if {"event", "time", "spacing", "speed", "lead_speed"} <= names:
         _refuse_idle(table.source, options, "event")
-        rows = _rows_of(table, event)
+        number, rows = _event(table, event)
         time, speed, spacing, lead = (table.numbers(n)[rows] for n in ("time", "speed", "spacing", "lead_speed"))
-        return _whole(f"NGSIM {table.numbers('event')[rows.start]:.0f}", time, speed, spacing, lead)
+        return _whole(f"NGSIM {number}", time, speed, spacing, lead)
     _refuse_idle(table.source, options, "map", "unit", "stamp")
     return Log.read(path, map=map, unit=unit, stamp=stamp, following=True)
 
@@ -136,12 +132,7 @@ _RECORDED = re.compile(
 )
 
 
-def _recorded(names: Iterable[str]) -> set[str]:
-    """Those of a file's columns that a known form has."""
-    return {name for name in names if _RECORDED.fullmatch(name)}
-
-
-def _refuse_idle(source: str, options: dict[str, object], *takes: str) -> None:
+def _refuse_idle(source: str, options: Mapping[str, object], *takes: str) -> None:
     for option, value in options.items():
         if value is not None and option not in takes:
             argument = f"{option} {value}" if isinstance(value, (int, float)) else option
@@ -238,76 +229,14 @@ def _events(table: Table) -> dict[int, slice]:
     return found
 
 
-def _rows_of(table: Table, event: int | None) -> slice:
-    """The rows of an event; None: of the longest one, of several the first by number."""
+def _event(table: Table, event: int | None) -> tuple[int, slice]:
+    """The number of an event and its rows; None: the longest one, of several the first by number."""
     events = _events(table)
     if event is None:
         event = max(sorted(events), key=lambda one: events[one].stop - events[one].start)
     if event not in events:
         raise InputError(f"{table.source}: event {event} is not in it; events {min(events)} to {max(events)} are")
-    return events[event]
-
-
-def _event_leader(table: Table, event: int, rows: slice) -> RawLeader:
-    return _leader(table, "time", "lead_speed", name=f"NGSIM {event}", rows=rows, note=f"event {event}")
-
-
-DURATION_S = 80.0
-JOIN_SPEED_MPS = 0.2
-JOIN_WITHIN_S = 5.0
-_LOOK_S = 0.5  # the acceleration on either side of a joint is taken over this long
-
-
-def _joined(table: Table, duration: float) -> RawLeader:
-    """A leader of at least ``duration`` [s] out of events joined at equal speed.
-
-    Rule. Start with the longest event. At its end, search the first 5 s of every event not yet used (each leaves at
-    least 10 s to drive) for samples whose lead speed is within 0.2 m/s of the last one; take the sample whose
-    acceleration over the next 0.5 s is nearest to that of the last 0.5 s, ties to the lower event number, and go on
-    from the sample after it, speeds as recorded. Name and ``note`` of the result list what was joined. Raises
-    InputError where no event fits before ``duration`` is reached.
-    """
-    if not 0 < duration < np.inf:
-        raise InputError(f"duration: is {duration}; a positive number of seconds is needed")
-    events = _events(table)
-    leaders = {event: _event_leader(table, event, events[event]) for event in sorted(events)}
-    start = max(leaders, key=lambda event: events[event].stop - events[event].start)
-    time, speed = leaders[start].time, leaders[start].speed
-    used, joints = [start], []
-    while time[-1] < duration - 1e-9:
-        fit = _best_fit(time, speed, {i: x for i, x in leaders.items() if i not in used})
-        if fit is None:
-            raise InputError(
-                f"{table.source}: after {time[-1]:.1f} s (events {used}) no further event starts within "
-                f"{JOIN_SPEED_MPS} m/s of {speed[-1]:.2f} m/s; ask for a shorter duration than {duration:g} s"
-            )
-        event, sample = fit
-        other = leaders[event]
-        joints.append(f"at {time[-1]:.1f} s")
-        time = np.concatenate([time, time[-1] + other.time[sample + 1 :] - other.time[sample]])
-        speed = np.concatenate([speed, other.speed[sample + 1 :]])
-        used.append(event)
-    listing = ", ".join(map(str, used))
-    note = f"events {listing} joined at equal speed ({', '.join(joints)})" if joints else f"event {listing}"
-    return RawLeader(time, speed, f"NGSIM {'+'.join(map(str, used))}", note)
-
-
-def _best_fit(time: NDArray, speed: NDArray, others: dict[int, RawLeader]) -> tuple[int, int] | None:
-    before = _slope(time, speed, time[-1] - _LOOK_S, time[-1])
-    best: tuple[float, int, int] | None = None
-    for event, other in others.items():
-        early = other.time <= min(JOIN_WITHIN_S, other.time[-1] - 10)
-        for sample in np.flatnonzero(early & (np.abs(other.speed - speed[-1]) <= JOIN_SPEED_MPS)):
-            at = other.time[sample]
-            kink = abs(_slope(other.time, other.speed, at, at + _LOOK_S) - before)
-            if best is None or (kink, event, int(sample)) < best:
-                best = (kink, event, int(sample))
-    return None if best is None else best[1:]
-
-
-def _slope(time: NDArray, speed: NDArray, start: float, end: float) -> float:
-    a, b = np.interp([start, end], time, speed)
-    return float(b - a) / (end - start)
+    return event, events[event]
 
 
 _FOLLOWING_STEP_S = 0.25

@@ -119,10 +119,10 @@ class Log(Displayed):
                     f"{place(path)}: time is mapped to {named}; channels of a recording have clocks of their own"
                 )
             columns = {signal: mapping.column.get(signal, signal) for signal in SIGNALS if signal != "time"}
-            recorded, arrived = merged(open_recording(path), columns)
+            recorded, arrived = merged(open_recording(path, columns.values()), columns)
             return cls._of(recorded, mapping, following=following, arrived=arrived)
         wanted = {mapping.column.get(signal, signal) for signal in SIGNALS} | set(mapping.stamp.values())
-        table = read_table(path, wanted=lambda names: wanted)
+        table = read_table(path, wanted=wanted)
         return cls._of(table, mapping, following=following)
 
     @classmethod
@@ -346,11 +346,7 @@ def as_log(
         return Log.read(given, map=map, unit=unit, following=following)
     if is_dataframe(given):
         return Log.from_dataframe(given, map=map, unit=unit, following=following)
-    kind = type(given).__name__
-    hint = "; columns by name make one with Log.from_arrays(**columns)" if isinstance(given, dict) else ""
-    if isinstance(given, (list, tuple)):
-        hint = "; one log at a time"
-    raise InputError(f"{argument}: found a {kind}, needs a Log, a path or a DataFrame{hint}")
+    raise InputError(f"{argument}: found a {type(given).__name__}, needs a Log, a path or a DataFrame")
 
 
 def as_logs(

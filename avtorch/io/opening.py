@@ -5,12 +5,10 @@ TOML is parsed in bounded time; an error names its line and quotes none of its c
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 import stat
 import tomllib
-from pathlib import Path
 from typing import Any, BinaryIO
 
 from avtorch.errors import InputError, printable
@@ -24,24 +22,11 @@ MOST_CELLS = 20_000_000
 """Maximum of the used columns: seven hours of four signals at 200 Hz, about 1.3 GB while they are read."""
 
 
-_KINDS = {
-    stat.S_IFLNK: "a symbolic link",
-    stat.S_IFDIR: "a directory",
-    stat.S_IFIFO: "a named pipe",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-}
 _PATH = 200  # characters of a path in a message
 
 
 class TooLarge(InputError):
     """A file with more bytes than its reader takes."""
-
-
-def kind_of(mode: int) -> str:
-    """What lies there instead of a regular file, by the `mode` of its status."""
-    return _KINDS.get(stat.S_IFMT(mode), "no regular file")
 
 
 def place(path: str | os.PathLike[str]) -> str:
@@ -69,7 +54,9 @@ def opened(path: str | os.PathLike[str], *, need: str, links: bool = True) -> Bi
     try:
         mode = os.fstat(handle).st_mode
         if not stat.S_ISREG(mode):
-            raise InputError(f"{shown}: is {kind_of(mode)}; {need} is needed")
+            raise InputError(
+                f"{shown}: is {'a directory' if stat.S_ISDIR(mode) else 'no regular file'}; {need} is needed"
+            )
         return os.fdopen(handle, "rb")
     except BaseException:
         os.close(handle)
@@ -107,13 +94,10 @@ def _read(stream: BinaryIO, most: int) -> bytes:
 
 
 def _why(path: str | os.PathLike[str], fault: Exception) -> str:
-    if isinstance(fault, OSError):
-        if fault.errno == errno.ENXIO:
-            return "is a socket or a device"
-        if fault.errno == errno.EISDIR or (fault.errno == errno.EACCES and Path(path).is_dir()):
-            return "is a directory"
-        return f"cannot be read ({fault.strerror or type(fault).__name__})"
-    return f"cannot be read ({printable(str(fault), 80)})"
+    if os.path.isdir(path):  # what Windows says only when it is opened
+        return "is a directory"
+    reason = fault.strerror or type(fault).__name__ if isinstance(fault, OSError) else printable(str(fault), 80)
+    return f"cannot be read ({reason})"
 
 
 MOST_TOML = 1_000_000

@@ -13,7 +13,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -84,36 +84,29 @@ class Damaged(InputError):
 
 
 class Sealed(NamedTuple):
-    """What a file belongs to (`of`), and its `content`: from JSON, or bytes."""
+    """What a file belongs to (`of`), and its `content`."""
 
     of: dict[str, Any]
-    content: Any
+    content: bytes
 
 
-def write_sealed(path: Path, content: Any, *, schema: str, of: Mapping[str, Any]) -> None:
-    """Write `content` (bytes, or what `json_text` accepts) so that `path` is complete or unchanged.
+def write_sealed(path: Path, content: bytes, *, schema: str, of: Mapping[str, Any]) -> None:
+    """Write `content` so that `path` is complete or unchanged.
 
     `of`: what it belongs to. Raises `InputError` where `path` cannot be written.
     """
     # a file's name may contain bytes that are not UTF-8
-    body = content if isinstance(content, bytes) else json_text(content, ascii_only=True).encode()
-    rest = json_text({"schema": schema, "of": of}, indent=None, ascii_only=True).encode() + b"\n" + body
+    rest = json_text({"schema": schema, "of": of}, indent=None, ascii_only=True).encode() + b"\n" + content
     with atomic(path, binary=True) as stream:
         stream.write(hashlib.sha256(rest).hexdigest().encode() + b"\n" + rest)
 
 
-def read_sealed(path: Path, *, schema: str, most: int = MOST, remedy: str = REMEDY) -> Sealed:
-    """Read what `write_sealed` wrote from JSON content.
+def read_sealed_bytes(path: Path, *, schema: str, most: int = MOST, remedy: str = REMEDY) -> Sealed:
+    """Read what `write_sealed` wrote.
 
     `most`: bytes, above which the file is not read. `remedy`: advice to the user, the end of every message. Raises
     `InputError` for what is no regular file, `Damaged` for anything but a file of this `schema` as it was written.
     """
-    found = read_sealed_bytes(path, schema=schema, most=most, remedy=remedy)
-    return Sealed(found.of, _parsed(found.content, path, remedy))
-
-
-def read_sealed_bytes(path: Path, *, schema: str, most: int = MOST, remedy: str = REMEDY) -> Sealed:
-    """The same of a file with bytes as its content. Raises `InputError` and `Damaged` likewise."""
     try:
         raw = read_regular(path, most=most, need="a regular file", links=False)
     except TooLarge:
@@ -126,20 +119,12 @@ def read_sealed_bytes(path: Path, *, schema: str, most: int = MOST, remedy: str 
     if first != hashlib.sha256(rest).hexdigest().encode():
         raise Damaged(f"{path}: is damaged, changed by hand or of an earlier avtorch: its checksum is wrong; {remedy}")
     line, _, content = rest.partition(b"\n")
-    head = _parsed(line, path, remedy)
+    try:
+        head = json.loads(line)
+    except (ValueError, RecursionError):
+        head = None
     if not isinstance(head, dict) or set(head) != {"schema", "of"} or not isinstance(head["of"], dict):
         raise Damaged(f"{path}: is no {schema} inside; {remedy}")
     if head["schema"] != schema:
         raise Damaged(f"{path}: holds {str(head['schema'])[:80]}, needs {schema}; {remedy}")
     return Sealed(head["of"], content)
-
-
-def _parsed(text: bytes, path: Path, remedy: str) -> Any:
-    try:
-        return json.loads(text, parse_constant=_no_number)
-    except (ValueError, RecursionError):
-        raise Damaged(f"{path}: holds no JSON of finite numbers; {remedy}") from None
-
-
-def _no_number(text: str) -> NoReturn:
-    raise ValueError(text)

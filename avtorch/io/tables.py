@@ -7,7 +7,7 @@ import math
 import os
 import re
 from array import array
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
-from avtorch.io.formats.apart import parquet_apart
+from avtorch.io.formats.apart import Wanted, parquet_apart
 from avtorch.io.formats.kinds import reason
 from avtorch.io.formats.parquet import Cells, readable
 from avtorch.io.formats.parquet import cells_of as arrow_cells
@@ -27,9 +27,6 @@ from avtorch.io.text import decoded, is_time, is_value, layout_of, rows_of, seco
 from avtorch.numeral import numeral
 
 _NEED = "a CSV or Parquet file"
-
-Wanted = Callable[[tuple[str, ...]], Collection[str]]
-"""Selects the columns to read from the names of a file's columns."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +178,7 @@ def _no_number(cell: Any, need: str) -> str:
     return f"{quoted(cell, 30)} is no number; a number is needed"
 
 
-def read_table(path: str | os.PathLike[str], *, wanted: Wanted | None = None) -> Table:
+def read_table(path: str | os.PathLike[str], *, wanted: Wanted = None) -> Table:
     """Read a table of text or a Parquet file, of the columns only those that are `wanted` (default: all).
 
     Text is UTF-8, UTF-16 or Windows-1252, may be gzipped, and has its separator, decimal mark, comments and row of
@@ -191,7 +188,8 @@ def read_table(path: str | os.PathLike[str], *, wanted: Wanted | None = None) ->
     512 MiB, 10,000 columns, 1,000,000 characters in a row, or 20 million cells in the wanted columns.
     """
     file = Path(path)
-    wanted = None if wanted is None else _with_halves(wanted)
+    if wanted is not None and not isinstance(wanted, re.Pattern):
+        wanted = {half for name in wanted for half in (name, *name.split(_AND))}
     if beginning(file, 4, need=_NEED) == b"PAR1":
         return _parquet(file, wanted)
     raw = unzipped(place(file), read_regular(file, most=MOST_BYTES, need=_NEED))
@@ -203,7 +201,7 @@ def read_table(path: str | os.PathLike[str], *, wanted: Wanted | None = None) ->
     return replace(text_table(place(file), text, wanted), remarks=remarks)
 
 
-def _parquet(file: Path, wanted: Wanted | None) -> Table:
+def _parquet(file: Path, wanted: Wanted) -> Table:
     names, columns = parquet_apart(file, wanted)
     read = {
         name: arrow_cells(columns.column(name), f"{place(file)}: column {quoted(name)}")
@@ -212,13 +210,14 @@ def _parquet(file: Path, wanted: Wanted | None) -> Table:
     return Table(place(file), names, tuple(read.get(name) for name in names), form="Parquet")
 
 
-def text_table(source: str, text: str, wanted: Wanted | None) -> Table:
+def text_table(source: str, text: str, wanted: Wanted) -> Table:
     """A table of text, by its own layout."""
     layout = layout_of(io.StringIO(text, newline=""))
     rows = rows_of(source, text, layout)
     names = _names(source, next(rows, None))
-    chosen = set(names if wanted is None else wanted(names))
-    kept = [i for i, name in enumerate(names) if name in chosen]
+    if isinstance(wanted, re.Pattern):
+        wanted = [name for name in names if wanted.fullmatch(name)]
+    kept = [i for i, name in enumerate(names) if wanted is None or name in wanted]
     stated = next(rows, ([], 0))[0] if layout.units else []
     units = {name: unit.strip() for name, unit in zip(names, stated, strict=False) if unit.strip()}
     columns: list[list[str]] = [[] for _ in kept]
@@ -269,16 +268,6 @@ def whole_stamps(names: Collection[str]) -> dict[str, tuple[str, str]]:
             if seconds in names:
                 found[f"{seconds}{_AND}{name}"] = seconds, name
     return found
-
-
-def _with_halves(wanted: Wanted) -> Wanted:
-    """What is wanted of a file's columns, with both columns of a stamp that is."""
-
-    def chosen(names: tuple[str, ...]) -> set[str]:
-        named = set(wanted(names))
-        return named | {half for whole, halves in whole_stamps(names).items() if whole in named for half in halves}
-
-    return chosen
 
 
 def _whole(seconds: Cells | None, nanoseconds: Cells | None) -> Cells | None:

@@ -17,6 +17,7 @@ import re
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -92,42 +93,14 @@ def unzipped(source: str, raw: bytes) -> bytes:
 
 def decoded(source: str, raw: bytes) -> tuple[str, tuple[str, ...]]:
     """Text, and a remark on its encoding where that had to be guessed. Raises InputError for what is no text."""
-    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return _utf16(source, raw), ()
-    if b"\0" in raw:
-        line = _line(raw[: raw.index(b"\0")])
-        raise InputError(f"{source}: line {line}: holds a zero byte, so it is binary; {_NEEDED}")
-    try:
-        return raw.decode("utf-8-sig"), ()
-    except UnicodeDecodeError as fault:
-        # after a byte order mark the codec counts from behind it
-        start = fault.start + (3 if raw.startswith(b"\xef\xbb\xbf") and len(fault.object) < len(raw) else 0)
-    odd = _BINARY.search(raw)
-    try:
-        if odd is None:
-            text = raw.decode("cp1252")
-            remark = f"line {_line(raw[:start])} is not UTF-8: the text is read as Windows-1252 (Latin-1)"
-            return text, (remark,)
-    except UnicodeDecodeError:
-        pass
-    raise InputError(f"{source}: line {_line(raw[:start])}, byte {start + 1}: is not UTF-8 text; {_NEEDED}")
-
-
-_NEEDED = "a CSV or Parquet file is needed"
-
-
-def _utf16(source: str, raw: bytes) -> str:
-    try:
-        text = raw.decode("utf-16")
-    except UnicodeDecodeError as fault:
-        raise InputError(f"{source}: byte {fault.start + 1}: is not UTF-16 text; {_NEEDED}") from None
-    if "\0" in text:
-        raise InputError(f"{source}: holds a zero character, so it is binary; {_NEEDED}")
-    return text
-
-
-def _line(before: bytes) -> int:
-    return len(re.findall(rb"\r\n|\r|\n", before)) + 1
+    guess = "the text is not UTF-8: it is read as Windows-1252 (Latin-1)"
+    wide = raw.startswith((b"\xff\xfe", b"\xfe\xff"))
+    for code in ("utf-16",) if wide else ("utf-8-sig", "cp1252"):
+        with suppress(UnicodeDecodeError):
+            text = raw.decode(code)
+            if "\0" not in text and (code != "cp1252" or _BINARY.search(raw) is None):
+                return text, (guess,) if code == "cp1252" else ()
+    raise InputError(f"{source}: is no text; a CSV or Parquet file is needed")
 
 
 COMMENT = ("#", "//", "%")

@@ -19,7 +19,7 @@ from avtorch.io.quality import check as check_quality
 from avtorch.io.tables import DataFrame, frame_table, is_dataframe, read_table
 from avtorch.logcheck.assignment import table_of
 from avtorch.logcheck.proposal import Proposal, propose
-from avtorch.logcheck.recorder import duration_note, excitation_notes, recorder_notes
+from avtorch.logcheck.recorder import excitation_notes, recorder_notes
 
 
 @dataclass(frozen=True, repr=False)
@@ -163,5 +163,6 @@ def _seen(source: str, form: str, proposal: Proposal | None, log: Log) -> LogChe
         require_usable(log)
     except InputError as too_little:
         fault = str(too_little)
-    excitation = [*excitation_notes(log), duration_note(log, quality.jitter)]
-    return LogCheck(source, form, proposal, log, quality, fault, tuple(recorder_notes(log)), tuple(excitation))
+    return LogCheck(
+        source, form, proposal, log, quality, fault, tuple(recorder_notes(log)), tuple(excitation_notes(log))
+    )

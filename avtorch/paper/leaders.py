@@ -52,9 +52,8 @@ class Leaders:
     def read(cls, data: str | os.PathLike[str] | None = None) -> Leaders:
         """Out of a folder of recordings, in the sub-folders `ngsim`, `openacc_zalazone` and `openacc_astazero`.
 
-        NGSIM: the longest event, and where it is shorter than the sweep, events joined at equal speed; `which` names
-        them. OpenACC: car 2 of ZalaZONE `handling_part40` from 4 s on, and car 5 of AstaZero platoon 7 from 300 s on.
-        Every acceleration is Gaussian-smoothed (`Leader.from_speed`). None: US06 for all of them.
+        NGSIM: the longest event. OpenACC: car 2 of ZalaZONE `handling_part40` from 4 s on, and car 5 of AstaZero
+        platoon 7 from 300 s on. Every acceleration is Gaussian-smoothed (`Leader.from_speed`). None: US06 for all.
 
         Raises `InputError` where the folder or one of the files is missing or cannot be read.
         """
@@ -65,7 +64,7 @@ class Leaders:
         folder = Path(data)
         if not folder.is_dir():
             raise InputError(f"data: {folder} is not a folder; needs the recordings' own, or leave it out for US06")
-        raw = read_leader(_file(folder, _NGSIM), duration=SWEEP_S)
+        raw = read_leader(_file(folder, _NGSIM))
         leader = Leader.from_speed(raw.time, raw.speed, name=raw.name)
         ngsim = Ahead(leader, raw.name, f"{raw.note}, {leader.duration:.1f} s")
         lively = _openacc(folder, "OpenACC ZalaZONE", *_LIVELY)

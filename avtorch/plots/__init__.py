@@ -17,90 +17,50 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from avtorch.plots.diagnosis import ratio_figure
     from avtorch.plots.drive import diagnosis_figure
-    from avtorch.plots.paper import PAPER_PICTURES, paper_pictures
-    from avtorch.plots.pedals import pedal_figure, pedal_lines
-    from avtorch.plots.plane import (
-        gain_curve,
-        region,
-        region_figure,
-        setting_region,
-        stability_figure,
-        verdict_legend,
-        verdict_map,
-    )
-    from avtorch.plots.posteriors import (
-        VALIDATION_PICTURES,
-        agreement_scatter,
-        exact_density,
-        joint_cloud,
-        marginals,
-        validation_figures,
-    )
-    from avtorch.plots.ratios import ratio_figure, ratio_whiskers
+    from avtorch.plots.paper import paper_pictures
+    from avtorch.plots.pedals import pedal_figure
+    from avtorch.plots.plane import gain_curve, region, region_figure, stability_figure, verdict_legend
+    from avtorch.plots.posteriors import marginals, validation_figures
     from avtorch.plots.signatures import effect_signature, signature_figure
     from avtorch.plots.style import STYLE, save, show
-    from avtorch.plots.time import (
-        belief_band,
-        belief_figure,
-        data_quality,
-        events,
-        motion,
-        motion_figure,
-        overview_figure,
-        probability_figure,
-        string_probability,
-    )
+    from avtorch.plots.time import belief_figure, motion_figure, overview_figure, probability_figure
 
 _HOME = {
+    "diagnosis": "ratio_figure",
     "drive": "diagnosis_figure",
-    "paper": "PAPER_PICTURES paper_pictures",
-    "pedals": "pedal_figure pedal_lines",
-    "plane": "gain_curve region region_figure setting_region stability_figure verdict_legend verdict_map",
-    "posteriors": "VALIDATION_PICTURES agreement_scatter exact_density joint_cloud marginals validation_figures",
-    "ratios": "ratio_figure ratio_whiskers",
+    "paper": "paper_pictures",
+    "pedals": "pedal_figure",
+    "plane": "gain_curve region region_figure stability_figure verdict_legend",
+    "posteriors": "marginals validation_figures",
     "signatures": "effect_signature signature_figure",
     "style": "STYLE save show",
-    "time": "belief_band belief_figure data_quality events motion motion_figure overview_figure probability_figure "
-    "string_probability",
+    "time": "belief_figure motion_figure overview_figure probability_figure",
 }
 _MODULE_OF = {name: f"avtorch.plots.{home}" for home, names in _HOME.items() for name in names.split()}
 
 __all__ = [
-    "PAPER_PICTURES",
     "STYLE",
-    "VALIDATION_PICTURES",
-    "agreement_scatter",
-    "belief_band",
     "belief_figure",
-    "data_quality",
     "diagnosis_figure",
     "effect_signature",
-    "events",
-    "exact_density",
     "gain_curve",
-    "joint_cloud",
     "marginals",
-    "motion",
     "motion_figure",
     "overview_figure",
     "paper_pictures",
     "pedal_figure",
-    "pedal_lines",
     "probability_figure",
     "ratio_figure",
-    "ratio_whiskers",
     "region",
     "region_figure",
     "save",
-    "setting_region",
     "show",
     "signature_figure",
     "stability_figure",
-    "string_probability",
     "validation_figures",
     "verdict_legend",
-    "verdict_map",
 ]
 
 

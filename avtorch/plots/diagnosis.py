@@ -1,16 +1,13 @@
-"""Drawings of a diagnosis: the gap over time, where it lies, its cause, how far it shrinks, the loop's stability.
-
-Figures are as wide as a desk's page; with `narrow` as a phone, panels one above the other.
-"""
+"""Drawings of a diagnosis, its budget, its cause, where the gap lies, how far it shrinks; and of a comparison."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator, PercentFormatter
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
@@ -25,11 +22,9 @@ from avtorch.plots.style import (
     BLUE,
     GREY,
     LABELS,
-    NARROW,
     ORANGE,
     SKY,
     VERMILLION,
-    WIDE,
     legend,
     panels_of,
     styled,
@@ -41,27 +36,26 @@ _MOST = 7  # hypotheses in a picture
 _SECONDS = 25.0  # seconds of a drive in a picture
 
 
-def budget_bars(ax: Axes, budget: Budget, *, narrow: bool = False) -> Axes:
+def budget_bars(ax: Axes, budget: Budget) -> Axes:
     """The gap's budget: each part's share begins where the one before it ends; whiskers are central 90 % intervals.
 
     Without any part all of the gap is unexplained, so the bars divide the error: what is unexplained, and noise.
-    `narrow`: names above their bars rather than beside them.
     """
     rows = _bars_of(budget)
     begun, reach = 0.0, 1.0
     for i, (_, share, colour) in enumerate(rows):
-        ax.barh(i, share.mean, left=begun, color=colour, height=_height(narrow))
+        ax.barh(i, share.mean, left=begun, color=colour, height=0.64)
         ax.plot([begun + share.q05, begun + share.q95], [i, i], color=BLACK, lw=1.0)
         ax.text(max(begun + share.q95, begun + share.mean) + 0.012, i, percent(share.mean), va="center", fontsize=9)
         if i:
             ax.plot([begun, begun], [i - 1, i], color=GREY, lw=0.6)
         reach = max(reach, begun + share.q95)  # a whisker may end beyond the whole
         begun += share.mean
-    _name_bars(ax, [name for name, _, _ in rows], narrow=narrow, down=True)
+    ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])
     ax.set(
         xlabel=f"share of the {'gap' if budget.parts else 'error'} in held-out {budget.horizon_s:.3g} s rollouts",
-        xlim=(0, reach * (1.25 if narrow else 1.12)),
-        ylim=(len(rows) - 0.4, -0.8 if narrow else -0.6),
+        xlim=(0, reach * 1.12),
+        ylim=(len(rows) - 0.4, -0.6),
     )
     ax.set_xticks(_UP_TO_ONE)
     ax.xaxis.set_major_formatter(PercentFormatter(1.0, 0, " %"))
@@ -81,23 +75,6 @@ def _bars_of(budget: Budget) -> list[tuple[str, Quantity, str]]:
 
 
 _UP_TO_ONE = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-
-
-def _height(narrow: bool) -> float:
-    """Of a bar in rows: a narrow picture has the bar's name above it."""
-    return 0.4 if narrow else 0.64
-
-
-def _name_bars(ax: Axes, names: Sequence[str], *, narrow: bool, down: bool) -> None:
-    """Names beside the bars, or in a `narrow` picture above them, where a long one costs the bars no width.
-
-    `down`: rows are counted from the top.
-    """
-    ax.set_yticks(range(len(names)), [] if narrow else names)
-    if narrow:
-        ax.tick_params(axis="y", length=0)
-        for i, name in enumerate(names):
-            ax.text(0.0, i + (-0.26 if down else 0.26), name, va="bottom", fontsize=9)
 
 
 def traces_of(found: Diagnosis) -> Traces:
@@ -122,31 +99,24 @@ def _liveliest(time: FloatArray, stretch: IntArray, size: FloatArray, seconds: f
     return best
 
 
-def _label(candidate: Candidate, end: str) -> str:
-    """A hypothesis's name, its two lines parted by `end` or on one."""
+def _label(candidate: Candidate) -> str:
+    """A hypothesis's name, on two lines."""
     count = len(candidate.effects)
-    gap = end or " "
-    return candidate.name.replace("+", f" +{gap}") if count < 3 else f"the {count} effects{gap}of the budget"
-
-
-def _bars_figure(rows: int, narrow: bool) -> Figure:
-    """For so many bars."""
-    size = (NARROW, 0.9 + 0.5 * rows) if narrow else (WIDE, 0.9 + 0.36 * rows)
-    return Figure(figsize=size, layout="constrained")
+    return candidate.name.replace("+", " +\n") if count < 3 else f"the {count} effects\nof the budget"
 
 
 @styled
-def budget_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
+def budget_figure(found: Diagnosis) -> Figure:
     """The budget of the gap. Raises `InputError` where the diagnosis has none."""
     if found.budget is None:
         raise InputError("budget: the diagnosis has none to draw; its drives are too short to hold out blocks")
-    figure = _bars_figure(len(_bars_of(found.budget)), narrow)
-    budget_bars(figure.add_subplot(), found.budget, narrow=narrow)
+    figure, (ax,) = panels_of(1, 0.9 + 0.36 * len(_bars_of(found.budget)))
+    budget_bars(ax, found.budget)
     return figure
 
 
 @styled
-def road_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
+def road_figure(found: Diagnosis) -> Figure:
     """What was measured, and what is simulated before and after the repair, where the effect does most.
 
     The channel is the acceleration, unless only the speed shows it. Raises `InputError` where there are no traces.
@@ -163,7 +133,7 @@ def road_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     measured, before, after = (x[k][inside] for x in (traces.measured, traces.before, traces.after))
     if of_speed:  # a rollout begun at the measured speed
         before, after = (x + measured[0] - x[0] for x in (before, after))
-    figure, (ax,) = panels_of(1, 3.3, narrow=narrow)
+    figure, (ax,) = panels_of(1, 3.3)
     time = traces.time[inside]
     ax.plot(time, measured, color=BLACK, lw=1.2, label="measured")
     ax.plot(time, before, color=VERMILLION, label="baseline simulator")
@@ -174,18 +144,18 @@ def road_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     epochs_s = found.log.epochs_s
     ax.set(xlabel=time_label(epochs_s[0] if len(epochs_s) == 1 else 0.0), ylabel=LABELS[traces.channels[k]])
     ax.margins(x=0)
-    legend(figure, [ax], narrow=narrow)
+    legend(figure, [ax])
     return figure
 
 
 @styled
-def where_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
+def where_figure(found: Diagnosis) -> Figure:
     """Where the gap lies: along every axis that the log has the shares of the rows and of the effect's response, and
     the named parts. Raises `InputError` where there are no traces."""
     traces = traces_of(found)
     axes: dict[Axis, FloatArray | None] = {"time": traces.time, "speed": traces.speed, "command": traces.command}
     there: dict[Axis, FloatArray] = {axis: x for axis, x in axes.items() if x is not None}
-    figure, panels = panels_of(len(there), 2.6, narrow=narrow)
+    figure, panels = panels_of(len(there), 2.6)
     for i, (ax, (axis, x)) in enumerate(zip(panels, there.items(), strict=True)):
         low, high = np.quantile(x, (0.002, 0.998))
         edges = np.linspace(low, high if high > low else low + 1, _BINS + 1)
@@ -199,32 +169,30 @@ def where_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
             if part.axis == axis and not isinstance(part.begin, str) and not isinstance(part.end, str):
                 ends = part.begin - away, part.end - away
                 ax.axvspan(*ends, color=ORANGE, alpha=0.18, lw=0, label="named part of the gap")
-        ax.set(xlabel=f"{axis} [{UNITS[axis]}]", ylabel="" if i and not narrow else "share", ylim=(0, None))
+        ax.set(xlabel=f"{axis} [{UNITS[axis]}]", ylabel="" if i else "share", ylim=(0, None))
         ax.margins(x=0)
-    legend(figure, panels, narrow=narrow)
+    legend(figure, panels)
     return figure
 
 
 @styled
-def which_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
+def which_figure(found: Diagnosis) -> Figure:
     """A bar for each of the most probable hypotheses, the first at the top; the alias set in blue, the rest in grey."""
     some = list(found.candidates[:_MOST])[::-1]
-    figure = _bars_figure(len(some), narrow)
-    ax = figure.add_subplot()
+    figure, (ax,) = panels_of(1, 0.9 + 0.36 * len(some))
     colours = [BLUE if c.name in found.verdict.alias_set else "#BBBBBB" for c in some]
-    ax.barh(range(len(some)), [c.probability for c in some], color=colours, height=_height(narrow))
-    _name_bars(ax, [_label(c, "" if narrow else "\n") for c in some], narrow=narrow, down=False)
+    ax.barh(range(len(some)), [c.probability for c in some], color=colours, height=0.64)
+    ax.set_yticks(range(len(some)), map(_label, some))
     for i, c in enumerate(some):
         ax.text(c.probability + 0.01, i, f"{c.probability:.2f}", va="center", fontsize=9, color=BLACK)
     ax.set_xticks(_UP_TO_ONE)
-    ax.set(xlabel="probability", xlim=(0, 1.2 if narrow else 1.1))
-    ax.set_ylim(-0.5, len(some) - (0.2 if narrow else 0.5))
+    ax.set(xlabel="probability", xlim=(0, 1.1), ylim=(-0.5, len(some) - 0.5))
     ax.grid(axis="y", visible=False)
     return figure
 
 
 @styled
-def shrinkage_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
+def shrinkage_figure(found: Diagnosis) -> Figure:
     """Errors in held-out free runs, a panel a channel: before, with a black box, after, and the noise floor.
 
     Raises `InputError` where nothing was held out.
@@ -233,7 +201,7 @@ def shrinkage_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     if scores is None:
         raise InputError("shrinkage: found none, needs a diagnosis that names an effect")
     metrics = {w: m for w in ("accel", "speed") if (m := f"rollout_rmse_{w}") in scores.by_metric}
-    figure, panels = panels_of(len(metrics), 3.2, narrow=narrow)
+    figure, panels = panels_of(len(metrics), 3.2)
     for ax, (channel, metric) in zip(panels, metrics.items(), strict=True):
         own = scores.by_metric[metric]
         bars = (
@@ -247,7 +215,7 @@ def shrinkage_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
         over = "" if own.horizon_s is None else f" in free runs of {own.horizon_s:.3g} s"
         ax.set_xticks([])
         ax.set(xlabel=f"held-out blocks{over}", ylabel=f"error of {LABELS[channel]}", ylim=(0, None))
-    legend(figure, panels, narrow=narrow)
+    legend(figure, panels)
     return figure
 
 
@@ -299,7 +267,7 @@ def _driven_cells(found: Diagnosis) -> tuple[FloatArray, FloatArray, BoolArray]:
 
 
 @styled
-def free_form_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
+def free_form_figure(found: Diagnosis) -> Figure:
     """What the repaired simulator carries without a name, a panel for the map and one for the resistance.
 
     Raises `InputError` where it carries nothing.
@@ -312,7 +280,41 @@ def free_form_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
         for draw, size in ((_force_contours, form.sizes.table), (_resistance_line, form.sizes.resistance))
         if size > 0
     ]
-    figure, axes = panels_of(len(panels), 3.3, narrow=narrow, wide=4.3 * len(panels))
+    figure, axes = panels_of(len(panels), 3.3, wide=4.3 * len(panels))
     for ax, draw in zip(axes, panels, strict=True):
         draw(ax, found)
+    return figure
+
+
+@styled
+def ratio_figure(ratios: Mapping[str, Quantity], what: str = "ratio") -> Figure:
+    """A dot and its central 90 % for each of `ratios`, blue where one lies outside, under the label `what`.
+
+    Example:
+        >>> from avtorch.gap.quantity import Quantity
+        >>> from avtorch.plots import ratio_figure
+        >>> len(ratio_figure({"lag T_L [s]": Quantity(1.5, 0.1, 1.3, 1.7)}, "after / before").axes)
+        1
+    """
+    figure, (ax,) = panels_of(1, 0.9 + 0.5 * len(ratios))
+    for row, q in enumerate(ratios.values()):
+        colour = GREY if q.q05 <= 1 <= q.q95 else BLUE
+        ax.plot([q.q05, q.q95], [row, row], color=colour, linewidth=2.5)
+        ax.plot(q.mean, row, marker="o", markersize=8, color=colour)
+        ax.annotate(f"{q.mean:.3g}", (q.mean, row), (0, 8), textcoords="offset points", ha="center", fontsize=9)
+    ax.axvline(1.0, color=BLACK, linestyle="--", linewidth=1.1, zorder=1)
+    ax.set_yticks(range(len(ratios)), list(ratios))
+    ax.set_ylim(len(ratios) - 0.5, -0.7)
+    ax.set_xscale("log")
+    ends = [1.0, *(end for q in ratios.values() for end in (q.q05, q.q95) if end > 0)]
+    low, high = min(*ends, 0.9), max(*ends, 1.1)
+    pad = (high / low) ** 0.05
+    ax.set_xlim(low / pad, high * pad)
+    # decades are too far apart for ratios near one, even steps too close for ratios of a hundred
+    even = high / low < 8
+    ax.xaxis.set_major_locator(MaxNLocator(8) if even else LogLocator(10, (1, 2, 5), numticks=20))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.3g}"))
+    ax.grid(False, axis="y")
+    ax.set_xlabel(what)
     return figure

@@ -12,7 +12,6 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
-from matplotlib.ticker import NullLocator
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
@@ -27,20 +26,17 @@ from avtorch.plots.style import (
     BLUE,
     GREY,
     LABELS,
-    NARROW,
     ORANGE,
     PURPLE,
     VERMILLION,
     WIDE,
     legend,
-    panels_of,
     styled,
 )
 
-Against = Literal["command", "speed", "frequency", "earlier commands"]
+Against = Literal["command", "speed", "earlier commands"]
 
-_INTERVALS = {False: 260, True: 120}
-"""Intervals of a line, on a desk and on a phone."""
+_INTERVALS = 260  # of a line
 _SMALL = (4.0, 2.7)  # inches: as wide as a phone or half a desk's page
 _COLOURS = {
     "command": GREY,
@@ -140,15 +136,14 @@ def _panels(found: Diagnosis) -> dict[str, dict[str, FloatArray]]:
 
 
 @styled
-def drive_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
+def drive_figure(found: Diagnosis) -> Figure:
     """The whole drive, a panel a channel, the command with the acceleration or in a panel of its own.
 
     A simulated speed begins at the measured one every ten seconds. Raises `InputError` where there are no traces.
     """
     panels = _panels(found)
-    size = (NARROW if narrow else WIDE, 0.8 + 1.9 * len(panels))
-    figure = Figure(figsize=size, layout="constrained")
-    _drive(figure, found, panels, narrow=narrow)
+    figure = Figure(figsize=(WIDE, 0.8 + 1.9 * len(panels)), layout="constrained")
+    _drive(figure, found, panels)
     return figure
 
 
@@ -175,13 +170,11 @@ def diagnosis_figure(found: Diagnosis) -> Figure:
     parts = figure.add_gridspec(2, 1, height_ratios=heights)
     above, below = figure.add_subfigure(parts[0]), figure.add_subfigure(parts[1])
     budget_bars(above.add_subplot(), found.budget)
-    _drive(below, found, panels, narrow=False)
+    _drive(below, found, panels)
     return figure
 
 
-def _drive(
-    figure: FigureBase, found: Diagnosis, panels: Mapping[str, Mapping[str, FloatArray]], *, narrow: bool
-) -> None:
+def _drive(figure: FigureBase, found: Diagnosis, panels: Mapping[str, Mapping[str, FloatArray]]) -> None:
     axis, traces = drive_time(found), traces_of(found)
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for ax, (name, lines) in zip(axes, panels.items(), strict=True):
@@ -190,7 +183,7 @@ def _drive(
             # what was logged does not begin anew with a rollout, and a simulated acceleration does not either
             anew = name == LABELS["speed"] and label not in ("command", "measured")
             parts = traces.piece if anew else traces.stretch
-            line = envelope(axis.along, values, parts, _INTERVALS[narrow])
+            line = envelope(axis.along, values, parts, _INTERVALS)
             ax.plot(*line, color=_COLOURS[label], lw=0.9, label=label)
         ax.set_ylabel(name)
         if "measured" in lines:
@@ -198,7 +191,7 @@ def _drive(
             reach = _BEYOND * max(high - low, 1e-3)
             ax.set_ylim(low - reach, high + reach)
     axes[-1].set(xlabel=axis.label, xlim=(float(axis.along[0]), float(axis.along[-1])))
-    legend(figure, axes, narrow=narrow, columns=3)
+    legend(figure, axes, columns=3)
 
 
 def _shade(ax: Axes, axis: DriveTime) -> None:
@@ -253,23 +246,6 @@ def _against(ax: Axes, found: Diagnosis, left: Residuals, axis: Literal["command
     ax.set(xlabel=f"{axis} [{'m/s²' if axis == 'command' else 'm/s'}]", ylabel="mean residual [m/s²]")
 
 
-def _spectrum(ax: Axes, found: Diagnosis, left: Residuals) -> None:
-    """Power of the residual over frequency, with its central 90 %."""
-    for label, residual in sides(found, left).items():
-        spectrum = left.spectrum(residual)
-        if spectrum is not None:
-            # an interval of frequencies a point: a picture has no room for hundreds
-            few = np.unique(np.geomspace(1, len(spectrum.frequency), 60).astype(int)) - 1
-            f, power, low, high = (x[few] for x in (spectrum.frequency, spectrum.power, spectrum.low, spectrum.high))
-            ax.fill_between(f, low, high, color=_COLOURS[label], alpha=0.2, lw=0)
-            ax.plot(f, power, color=_COLOURS[label], lw=1.2, label=label)
-    ax.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="power [(m/s²)²/Hz]")
-    ax.margins(x=0)
-    for along in (ax.xaxis, ax.yaxis):
-        along.set_minor_locator(NullLocator())
-        along.set_major_formatter("{x:g}")
-
-
 def _correlation(ax: Axes, found: Diagnosis, left: Residuals) -> None:
     """Correlation of the residual with commands before it, and the band of 99 % for one that depends on none."""
     band = 0.0
@@ -291,9 +267,7 @@ def residual_figure(found: Diagnosis, against: Against) -> Figure:
     """
     figure, left = Figure(figsize=_SMALL, layout="constrained"), residuals_of(found)
     ax = figure.add_subplot()
-    if against == "frequency":
-        _spectrum(ax, found, left)
-    elif against == "earlier commands":
+    if against == "earlier commands":
         _correlation(ax, found, left)
     else:
         _against(ax, found, left, against)
@@ -301,34 +275,12 @@ def residual_figure(found: Diagnosis, against: Against) -> Figure:
     return figure
 
 
-@styled
-def residual_time_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
-    """The residual over the whole drive, and where 99 % of a steady one with the same quartiles would lie."""
-    traces, left, axis = traces_of(found), residuals_of(found), drive_time(found)
-    along = axis.along[np.searchsorted(_rising(traces.time, traces.stretch), _rising(left.time, left.stretch))]
-    figure, (ax,) = panels_of(1, 2.6, narrow=narrow)
-    usual = 0.0
-    for label, residual in sides(found, left).items():
-        line = envelope(along, residual, left.stretch, _INTERVALS[narrow])
-        ax.plot(*line, color=_COLOURS[label], lw=0.9, label=label)
-        usual = left.usual(residual)
-    ax.axhspan(-usual, usual, color=GREY, alpha=0.25, lw=0, zorder=0)
-    ax.set(xlabel=axis.label, ylabel="residual [m/s²]", xlim=(float(axis.along[0]), float(axis.along[-1])))
-    legend(figure, [ax], narrow=narrow)
-    return figure
-
-
-def _rising(time: FloatArray, stretch: FloatArray | np.ndarray) -> FloatArray:
-    """A key of rows that rises over all stretches, of which several logs may have the same times."""
-    return stretch * 1e7 + time
-
-
 # what to drive next ------------------------------------------------------------------------------------------------
 @styled
-def experiment_figure(experiment: Experiment, *, narrow: bool = False) -> Figure:
+def experiment_figure(experiment: Experiment) -> Figure:
     """The command of the experiment to drive next, held between rows, over the speed that is expected of it."""
     m = experiment.manoeuvre
-    figure = Figure(figsize=(NARROW, 4.2) if narrow else (WIDE, 4.0), layout="constrained")
+    figure = Figure(figsize=(WIDE, 4.0), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True)
     top.axhline(0.0, color=GREY, lw=0.6)
     top.step(m.time, m.command, where="post", color=BLUE, label="command")

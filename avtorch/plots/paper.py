@@ -332,9 +332,6 @@ _DRAWN: Mapping[str, tuple[str, Callable[[Any], Figure]]] = {
 }
 """By file: the experiment, and what draws it."""
 
-PAPER_PICTURES = tuple(_DRAWN)
-"""Every file that `paper_pictures` may name."""
-
 
 def _windows(one: Watched) -> list[dict[str, Any]]:
     """The first run's windows, as `belief_band` takes them."""

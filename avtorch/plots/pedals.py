@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from avtorch.pedals.pedal_map import PedalMap, unit_of
@@ -17,25 +16,6 @@ def shown_unit(name: str, largest: float) -> tuple[float, str]:
     """What a pedal's values are multiplied by to be shown, and the unit then; a brake's is by its largest value."""
     unit = unit_of(name, largest)
     return {"-": (100.0, "%"), "Pa": (1e-5, "bar")}.get(unit, (1.0, unit.replace("2", "²")))
-
-
-def pedal_lines(ax: Axes, made: PedalMap, pedal: str) -> Axes:
-    """The acceleration that one pedal demands at some speeds, the others at rest; bands are one standard error."""
-    table = made.pedals[pedal]
-    scale, unit = shown_unit(pedal, float(np.abs(table.pedal).max()))
-    low, high = made.driven or (made.speed[0], made.speed[-1])
-    driven = np.flatnonzero((made.speed >= low) & (made.speed <= high))
-    rows = np.unique(driven[np.linspace(0, len(driven) - 1, _LINES).round().astype(int)])
-    for colour, row in zip(_COLOURS, rows, strict=False):
-        level = made.coasting[row] + table.accel[:, row]
-        ax.plot(scale * table.pedal, level, color=colour, marker=".", label=f"{made.speed[row]:.3g} m/s")
-        if table.sd is not None:
-            error = table.sd[:, row]
-            ax.fill_between(scale * table.pedal, level - error, level + error, color=colour, alpha=0.15, linewidth=0)
-    ax.axhline(0.0, color=GREY, linestyle=":", linewidth=1)
-    ax.set(xlabel=f"{pedal} [{unit}]", ylabel="acceleration demanded [m/s²]", title=pedal)
-    ax.legend(loc="best")
-    return ax
 
 
 @styled
@@ -56,6 +36,18 @@ def pedal_figure(made: PedalMap) -> Figure:
     """
     count = len(made.pedals)
     figure = Figure(figsize=(1.5 + 4.2 * count, 3.8), layout="constrained")
-    for ax, pedal in zip(figure.subplots(1, count, squeeze=False)[0], made.pedals, strict=True):
-        pedal_lines(ax, made, pedal)
+    low, high = made.driven or (made.speed[0], made.speed[-1])
+    driven = np.flatnonzero((made.speed >= low) & (made.speed <= high))
+    rows = np.unique(driven[np.linspace(0, len(driven) - 1, _LINES).round().astype(int)])
+    for ax, (pedal, table) in zip(figure.subplots(1, count, squeeze=False)[0], made.pedals.items(), strict=True):
+        scale, unit = shown_unit(pedal, float(np.abs(table.pedal).max()))
+        for colour, row in zip(_COLOURS, rows, strict=False):
+            level = made.coasting[row] + table.accel[:, row]
+            ax.plot(scale * table.pedal, level, color=colour, marker=".", label=f"{made.speed[row]:.3g} m/s")
+            if table.sd is not None:
+                ends = level - table.sd[:, row], level + table.sd[:, row]
+                ax.fill_between(scale * table.pedal, *ends, color=colour, alpha=0.15, linewidth=0)
+        ax.axhline(0.0, color=GREY, linestyle=":", linewidth=1)
+        ax.set(xlabel=f"{pedal} [{unit}]", ylabel="acceleration demanded [m/s²]", title=pedal)
+        ax.legend(loc="best")
     return figure

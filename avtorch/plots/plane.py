@@ -21,7 +21,6 @@ from avtorch.plots.style import (
     BLUE,
     GREY,
     LABELS,
-    NARROW,
     ORANGE,
     PURPLE,
     STABLE,
@@ -67,7 +66,7 @@ def verdict_map(
         )
         if levels:
             lines = ax.contour(x, y, gain, levels=levels, colors="#B07A1E", linewidths=0.7)
-            ax.clabel(lines, fmt=lambda g: f"{g:g}", fontsize=7.5, manual=_inside(lines, x, y))
+            ax.clabel(lines, fmt=lambda g: f"{g:g}", fontsize=8, manual=_inside(lines, x, y))
     ax.grid(False)
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(y[0], y[-1])
@@ -228,7 +227,6 @@ def region_figure(
     clouds: Mapping[str, tuple[ArrayLike, ArrayLike]],
     *,
     truth: tuple[float, float] | None = None,
-    narrow: bool = False,
     points: int = 401,
 ) -> Figure:
     """The posterior cloud in the stability region of each named setting, side by side on the same axes.
@@ -251,16 +249,13 @@ def region_figure(
     T_range = (0.02, max(1.0, 1.25 * float(np.quantile(t, 0.99)), 1.25 * (truth[0] if truth else 0.0)))
     K_range = (min(0.25, 0.8 * float(np.quantile(k, 0.01))), max(1.3, 1.15 * float(np.quantile(k, 0.99))))
     count = len(settings)
-    size = (NARROW, 3.9 * count + 0.8) if narrow else (4.9 * count + 0.4, 5.2)
-    figure = Figure(figsize=size, layout="constrained")
-    shape = (count, 1) if narrow else (1, count)
-    axes = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False).ravel()
+    figure = Figure(figsize=(4.9 * count + 0.4, 5.2), layout="constrained")
+    axes = figure.subplots(1, count, sharex=True, sharey=True, squeeze=False)[0]
     for ax, (title, setting) in zip(axes, settings, strict=True):
         setting_region(ax, setting, T_range=T_range, K_range=K_range, clouds=clouds, truth=truth, points=points)
         ax.set_title(title)
         ax.label_outer()
-    columns = 1 if narrow else 3
-    figure.legend(handles=_handles(list(axes)), loc="outside lower center", ncols=columns, fontsize=8.5)
+    figure.legend(handles=_handles(list(axes)), loc="outside lower center", ncols=3, fontsize=8.5)
     return figure
 
 

@@ -19,27 +19,23 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from numpy.typing import ArrayLike
-from scipy.stats import gaussian_kde, uniform
+from scipy.stats import uniform
 from torch import Tensor
 
 from avtorch.arrays import FloatArray
 from avtorch.inference import Posterior, Quadrature
 from avtorch.inference.arviz_export import arviz
-from avtorch.plots.style import BLACK, BLUE, LABELS, NARROW, VERMILLION, legend, short, styled
+from avtorch.plots.style import BLACK, BLUE, LABELS, VERMILLION, legend, short, styled
 from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE, sampling_diagnostics
 from avtorch.validation.validate import Validation
 
 EXACT, EXACT_FILL = "#555555", "#DADADA"
-#: Points of a cloud at most; draws from which the contours of a reference are smoothed, and nodes an axis on which they
-#: are followed.
-SHOWN, KERNELS, MESH = 1500, 4000, 90
-CONTOURS: dict[str, Any] = {
-    "exact": {"color": BLACK, "linestyle": "-", "linewidth": 1.4},
-    "NUTS": {"color": VERMILLION, "linestyle": "--", "linewidth": 1.4},
-}
+_COLOURS = {"SGLD": BLUE, "NUTS": VERMILLION, "exact": EXACT}
+#: Points of a cloud at most.
+SHOWN = 1500
 TAIL = 5e-4
-#: Most bins of a histogram, and bins of ranks.
-BINS, RANKS = 2000, 10
+#: Most bins of a histogram.
+BINS = 2000
 
 
 def marginals(
@@ -117,45 +113,17 @@ def exact_density(quadrature: Quadrature, name: str, window: int = 0) -> tuple[n
     return z.exp().numpy(), (per_log.clamp_min(0.0) / z.exp()).numpy()
 
 
-def joint_cloud(
-    ax: Axes,
-    posterior: Posterior,
-    window: int = 0,
-    *,
-    references: Mapping[str, tuple[Posterior, int]] | None = None,
-    truth: tuple[float, float] | None = None,
-) -> Axes:
-    """Draws of T_L and K_L as a cloud, and the smallest regions that hold 50 and 90 % of each reference's draws.
-
-    The shares of the cloud within the regions of the first reference are written as the title; they are 50 and 90 %
-    where the two agree.
-
-    Args:
-        posterior: the posterior under test, drawn as points.
-        references: draws for the contours and which of their windows, by method: ``"exact"``, ``"NUTS"``.
-    """
-    cloud = _pair(posterior, window)
-    ax.plot(*evenly(cloud, SHOWN).T, ".", color=BLUE, markersize=2.5, alpha=0.4, rasterized=True)
-    ax.plot([], [], ".", color=BLUE, markersize=8, label="SGLD")
-    spread = [cloud]
-    for number, (method, (reference, own)) in enumerate((references or {}).items()):
-        drawn = evenly(_pair(reference, own), KERNELS)
-        spread.append(drawn)
-        kernel, levels = _regions(np.log(drawn))
-        axes = [np.linspace(*_widened(np.log(drawn[:, k])), MESH) for k in (0, 1)]
-        mesh = kernel(np.stack(np.meshgrid(*axes)).reshape(2, -1)).reshape(MESH, MESH)
-        look = CONTOURS.get(method, CONTOURS["exact"])
-        ax.contour(*np.exp(axes), mesh, levels=sorted(levels), zorder=3 + number,
-                   colors=look["color"], linestyles=look["linestyle"], linewidths=look["linewidth"])  # fmt: skip
-        ax.plot([], [], label=f"{method}, 50 and 90 % regions", **look)
-        if number == 0 and len(cloud):
-            at_cloud = kernel(np.log(evenly(cloud, 2 * KERNELS)).T)
-            inside = [100 * float((at_cloud >= level).mean()) for level in levels]
-            ax.set_title(f"SGLD inside: {inside[0]:.0f} and {inside[1]:.0f} %", loc="left")
+def joint_cloud(ax: Axes, clouds: Mapping[str, FloatArray], *, truth: tuple[float, float] | None = None) -> Axes:
+    """Draws of T_L and K_L (draw, 2) by method, ``"exact"``, ``"SGLD"`` or ``"NUTS"``, those that are finite."""
+    clouds = {method: draws[np.isfinite(draws).all(-1)] for method, draws in clouds.items()}
+    for method, draws in clouds.items():
+        colour = _COLOURS[method]
+        ax.plot(*evenly(draws, SHOWN).T, ".", color=colour, markersize=2.5, alpha=0.4, rasterized=True)
+        ax.plot([], [], ".", color=colour, markersize=8, label=method)
     if truth is not None:
-        ax.plot(*truth, "P", color=BLACK, markersize=9, markeredgecolor="white", label="truth", linestyle="none",
-                zorder=6)  # fmt: skip
-    both = np.concatenate(spread)
+        look: Any = {"color": BLACK, "markersize": 9, "markeredgecolor": "white", "linestyle": "none", "zorder": 6}
+        ax.plot(*truth, "P", label="truth", **look)
+    both = np.concatenate([*clouds.values(), *([] if truth is None else [np.array([truth])])])
     for k, limit in ((0, ax.set_xlim), (1, ax.set_ylim)) if len(both) else ():
         low, high = np.quantile(both[:, k], [0.001, 0.999])
         ends = [low, high] if truth is None else [min(low, truth[k]), max(high, truth[k])]
@@ -248,28 +216,6 @@ def _percent_axis(ax: Axes, x: np.ndarray) -> None:
         ax.xaxis.set_major_locator(MaxNLocator(5))
 
 
-def _pair(posterior: Posterior, window: int) -> np.ndarray:
-    """Finite draws of T_L and K_L, ``(draw, 2)``."""
-    columns = [posterior[name][..., window].flatten() for name in ("T_L", "K_L")]
-    both = torch.stack(columns, -1)
-    return both[both.isfinite().all(-1)].numpy()
-
-
-def _regions(draws: np.ndarray) -> tuple[gaussian_kde, tuple[float, float]]:
-    """A smooth density of draws ``(draw, 2)``, and its heights around 50 and 90 % of them."""
-    kernel = gaussian_kde(draws.T)
-    # leave one out: under its own kernel a draw's density would be too high
-    own = 1 / (2 * np.pi * np.sqrt(np.linalg.det(kernel.covariance)))
-    others = (len(draws) * kernel(draws.T) - own) / (len(draws) - 1)
-    fifty, ninety = np.quantile(others, [0.5, 0.1])
-    return kernel, (float(fifty), float(ninety))
-
-
-def _widened(values: np.ndarray, share: float = 0.15) -> tuple[float, float]:
-    pad = share * float(np.ptp(values))
-    return float(values.min()) - pad, float(values.max()) + pad
-
-
 def _edges(values: np.ndarray, width: float) -> np.ndarray:
     """Edges of bins of about that width; what lies far from nearly all the values shares one wide bin a side."""
     low, high = np.quantile(values, [0.05, 0.95])
@@ -281,10 +227,10 @@ def _edges(values: np.ndarray, width: float) -> np.ndarray:
 
 
 # pictures of a validation -------------------------------------------------------------------------------------------
-#: Exact draws a window, for contours and ranks.
+#: Exact draws a window.
 EXACT_DRAWS = 4000
-#: Groups that SGLD's chains are joined into for their ranks, and draws of a group at most.
-GROUPS, MOST = 4, 1000
+#: Draws whose exact probabilities are shown, at most.
+MOST = 1000
 
 
 @dataclass(frozen=True)
@@ -333,40 +279,24 @@ class ChosenWindows:
         drawn["SGLD"] = found.sgld.flat[:, window.number]
         return drawn if window.nuts is None else {**drawn, "NUTS": found.nuts.flat[:, window.nuts]}
 
-    def groups(self, row: int, i: int) -> dict[str, FloatArray]:
-        """Draws of the `i`-th parameter by group, as many as are effective: SGLD's chains in four, NUTS, exact."""
-        found, window = self.validation, self.windows[row]
-        parts = found.sgld.draws[:, :, window.number, i].tensor_split(min(GROUPS, found.sgld.draws.shape[0]))
-        worth = self._effective(row, i, "SGLD") / len(parts)
-        named = {f"SGLD {k + 1}": evenly(x.flatten().numpy(), _count(worth, x)) for k, x in enumerate(parts)}
-        drawn = self.draws(row)
-        if "NUTS" in drawn:
-            nuts = drawn["NUTS"][:, i]
-            named["NUTS"] = evenly(nuts.numpy(), _count(self._effective(row, i, "NUTS"), nuts))
-        return {**named, "exact": drawn["exact"][:, i].numpy()} if "exact" in drawn else named
-
     def exact_probabilities(self, row: int, i: int) -> dict[str, FloatArray]:
         """Of draws of the `i`-th parameter that are effective, the exact probability of what is below, by method."""
-        exact, number = self.validation.quadrature, self.windows[row].number
+        found, window = self.validation, self.windows[row]
+        exact, draws = found.quadrature, self.draws(row)
         assert exact is not None
-        one = Quadrature(exact.names, *(getattr(exact, f.name)[[number]] for f in fields(exact)[1:]))
+        one = Quadrature(exact.names, *(getattr(exact, f.name)[[window.number]] for f in fields(exact)[1:]))
+        effective = {"SGLD": found.agreement.ess_bulk[place(found.compared, window.number), i]}
+        if window.nuts is not None:
+            effective["NUTS"] = self._of_nuts[window.nuts, i]
         out = {}
-        for method, draws in self.draws(row).items():
-            if method == "exact":
-                continue
-            some = torch.from_numpy(evenly(draws.numpy(), _count(self._effective(row, i, method), draws)))
+        for method, count in effective.items():
+            some = torch.from_numpy(evenly(draws[method].numpy(), _count(float(count), draws[method])))
             out[method] = one.cdf(some[:, None])[:, 0, i].clamp(0, 1).numpy()
         return out
 
     @cached_property
     def _of_nuts(self) -> Tensor:
         return sampling_diagnostics(self.validation.nuts).ess_bulk
-
-    def _effective(self, row: int, i: int, method: str) -> float:
-        found, window = self.validation, self.windows[row]
-        if method == "SGLD":
-            return float(found.agreement.ess_bulk[place(found.compared, window.number), i])
-        return float(self._of_nuts[window.nuts, i])
 
     def truth(self, window: ChosenWindow, name: str) -> float | None:
         known = self.validation.windows.truth
@@ -401,16 +331,11 @@ def place(index: Tensor, window: int) -> int | None:
     return int(found[0]) if len(found) else None
 
 
-_COLOURS = {"SGLD": BLUE, "NUTS": VERMILLION, "exact": EXACT}
 METHOD = {"nuts": "NUTS", "quadrature": "quadrature"}
-VALIDATION_PICTURES = ("marginals.png", "joint.png", "ranks.png", "agreement.png", "ecdf.png")
-"""Every file that `validation_figures` may name."""
 
 
-def validation_figures(validation: Validation, *, narrow: bool = False) -> dict[str, Callable[[], Figure]]:
+def validation_figures(validation: Validation) -> dict[str, Callable[[], Figure]]:
     """The figures of a validation, by the name of the file that each is for; a figure is made when called.
-
-    `narrow`: for a phone, panels one above the other.
 
     Example:
         >>> from avtorch.inference import SamplerSettings
@@ -419,86 +344,62 @@ def validation_figures(validation: Validation, *, narrow: bool = False) -> dict[
         >>> quick = dict(settings=SamplerSettings(chains=64), nuts=NutsSettings(1, 20, 10), nuts_windows=1)
         >>> figures = validation_figures(validate(synthetic_windows(1, seed=1), **quick))
         >>> sorted(figures)
-        ['agreement.png', 'ecdf.png', 'joint.png', 'marginals.png', 'ranks.png']
+        ['agreement.png', 'ecdf.png', 'joint.png', 'marginals.png']
     """
     chosen = ChosenWindows(validation)
     figures: dict[str, Callable[[], Figure]] = {
-        "marginals.png": lambda: marginals_figure(chosen, narrow=narrow),
-        "joint.png": lambda: joint_figure(chosen, narrow=narrow),
-        "ranks.png": lambda: ranks_figure(chosen, narrow=narrow),
-        "agreement.png": lambda: agreement_figure(validation, narrow=narrow),
+        "marginals.png": lambda: marginals_figure(chosen),
+        "joint.png": lambda: joint_figure(chosen),
+        "agreement.png": lambda: agreement_figure(validation),
     }
     if validation.quadrature is not None:
-        figures["ecdf.png"] = lambda: ecdf_figure(chosen, narrow=narrow)
+        figures["ecdf.png"] = lambda: ecdf_figure(chosen)
     return figures
 
 
 @styled
-def marginals_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
+def marginals_figure(chosen: ChosenWindows) -> Figure:
     """Exact marginals with the histograms of SGLD and NUTS; a row a window, a column a parameter."""
     found, names = chosen.validation, chosen.validation.names
-    figure, axes = _panels(len(chosen.windows), len(names), (_wide(names), 2.3), narrow=narrow)
+    figure, axes = _panels(len(chosen.windows), len(names), (_wide(names), 2.3))
     for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
         for name, ax in zip(names, line, strict=True):
             other = None if window.nuts is None else found.nuts[name][..., window.nuts].numpy()
             own = found.sgld[name][..., window.number].numpy()
             marginals(ax, name, own, other, found.quadrature, window.number, truth=chosen.truth(window, name))
-            if row < len(axes) - 1 and not narrow:
+            if row < len(axes) - 1:
                 ax.set_xlabel("")
         line[0].set_title(window.title)
         line[0].set_ylabel("density")
-    _legend(figure, axes, narrow=narrow)
+    _legend(figure, axes)
     return figure
 
 
 @styled
-def joint_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
-    """Clouds of lag and gain within the 50 and 90 % regions of exact draws and of NUTS; a panel a window."""
+def joint_figure(chosen: ChosenWindows) -> Figure:
+    """Clouds of lag and gain by SGLD, by NUTS and exact; a panel a window."""
     found = chosen.validation
-    figure, axes = _panels(1, len(chosen.windows), (3.9, 3.7), narrow=narrow)
+    figure, axes = _panels(1, len(chosen.windows), (3.9, 3.7))
+    pair = [found.names.index(name) for name in ("T_L", "K_L")]
     for i, (window, ax) in enumerate(zip(chosen.windows, axes[0], strict=True)):
-        references = {} if chosen.exact is None else {"exact": (chosen.exact, i)}
-        if window.nuts is not None:
-            references["NUTS"] = (found.nuts, window.nuts)
         lag, gain = chosen.truth(window, "T_L"), chosen.truth(window, "K_L")
         truth = None if lag is None or gain is None else (lag, gain)
-        joint_cloud(ax, found.sgld, window.number, references=references, truth=truth)
-        ax.set_title("\n".join(t for t in (window.title, ax.get_title("left")) if t))
-        if i and not narrow:
+        joint_cloud(ax, {method: draws[:, pair].numpy() for method, draws in chosen.draws(i).items()}, truth=truth)
+        ax.set_title(window.title)
+        if i:
             ax.set_ylabel("")
-    _legend(figure, axes, narrow=narrow)
+    _legend(figure, axes)
     return figure
 
 
 @styled
-def ranks_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
-    """Ranks of groups of SGLD's chains, of NUTS and of exact draws in their common pool, by ArviZ; a row a window."""
-    names = chosen.validation.names
-    rows = len(chosen.groups(0, 0))
-    size = (_wide(names), 0.33 * rows + 0.6)
-    figure, axes = _panels(len(chosen.windows), len(names), size, beside=0.9, narrow=narrow)
-    for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
-        for i, (name, ax) in enumerate(zip(names, line, strict=True)):
-            groups = chosen.groups(row, i)
-            least = min(map(len, groups.values()))
-            pool = np.stack([evenly(x, least) for x in groups.values()])
-            arviz().plot_rank({name: pool}, bins=RANKS, ax=ax, colors=[_COLOURS[group.split()[0]] for group in groups])
-            ax.set(title="", ylabel="", xlabel=f"rank of {short(name)}" if row == len(axes) - 1 or narrow else "")
-            ax.xaxis.label.set_size("medium")
-            ax.set_yticklabels(list(groups) if narrow or not i else [])
-        line[0].set_title(window.title)
-    _title(figure, "Ranks of each group in the pool of all draws, as many as are effective: even bars agree", narrow)
-    return figure
-
-
-@styled
-def ecdf_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
+def ecdf_figure(chosen: ChosenWindows) -> Figure:
     """Exact probabilities below the draws: their ECDF less the uniform one and its 95 % band, by ArviZ; a row a window.
 
     Draws count by their effective sample size.
     """
     names = chosen.validation.names
-    figure, axes = _panels(len(chosen.windows), len(names), (_wide(names), 2.4), beside=0.5, narrow=narrow)
+    figure, axes = _panels(len(chosen.windows), len(names), (_wide(names), 2.4), beside=0.5)
     for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
         for i, (name, ax) in enumerate(zip(names, line, strict=True)):
             for method, values in chosen.exact_probabilities(row, i).items():
@@ -518,16 +419,16 @@ def ecdf_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
                 )
             ax.set(xlabel=f"exact probability below a draw of {short(name)}", ylabel="" if i else "ECDF less uniform")
         line[0].set_title(window.title)
-    _legend(figure, axes, narrow=narrow)
+    _legend(figure, axes)
     return figure
 
 
 @styled
-def agreement_figure(validation: Validation, *, narrow: bool = False) -> Figure:
+def agreement_figure(validation: Validation) -> Figure:
     """Differences of mean and ratios of SD of every window over the width of its posterior, with the limits."""
     names, found, index = validation.names, validation.agreement, validation.compared
     width, sound = relative_width(validation, index), converged(validation, index)
-    figure, axes = _panels(2, len(names), (_wide(names), 2.75), beside=0.4, sharey="row", narrow=narrow)
+    figure, axes = _panels(2, len(names), (_wide(names), 2.75), beside=0.4, sharey="row")
     measures = [
         ("difference of means [posterior SD]", found.mean_difference, found.mean_error, 0.0, MEAN_TOLERANCE),
         ("ratio of SDs [-]", found.sd_ratio, found.sd_error, 1.0, SD_TOLERANCE),
@@ -554,9 +455,8 @@ def agreement_figure(validation: Validation, *, narrow: bool = False) -> Figure:
         f"SGLD against {METHOD[validation.reference]}: {100 * v.share:.1f} % of {len(index)} windows within all limits"
         f" (95 % interval {100 * v.low:.1f} to {100 * v.high:.1f} %;"
         f" exact draws would be at {100 * v.share_if_exact:.1f} %)",
-        narrow,
     )
-    _legend(figure, axes, where="lower center", narrow=narrow)
+    _legend(figure, axes, where="lower center")
     return figure
 
 
@@ -572,26 +472,22 @@ def _panels(
     *,
     beside: float = 0.3,
     sharey: Literal["row"] | bool = False,
-    narrow: bool = False,
 ) -> tuple[Figure, np.ndarray]:
-    """A figure and its axes (row, column), each of a `panel`'s width and height [in]; `narrow`: all in one column."""
+    """A figure and its axes (row, column), each of a `panel`'s width and height [in]."""
     wide, high = panel
-    if narrow:
-        figure = Figure(figsize=(NARROW, high * rows * columns + 1.4), layout="constrained")
-        return figure, figure.subplots(rows * columns, 1, squeeze=False).reshape(rows, columns)
     figure = Figure(figsize=(wide * columns + beside, high * rows + 0.9), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, sharey=sharey)
 
 
-def _title(figure: Figure, text: str, narrow: bool) -> None:
+def _title(figure: Figure, text: str) -> None:
     """Above all panels, in lines as long as these are wide."""
-    letters = round((9.0 if narrow else 11.0) * figure.get_figwidth())
+    letters = round(11.0 * figure.get_figwidth())
     figure.suptitle("\n".join(textwrap.wrap(text, letters)), fontsize=9.5, color=BLACK)
 
 
-def _legend(figure: Figure, axes: np.ndarray, *, where: str = "upper center", narrow: bool = False) -> None:
+def _legend(figure: Figure, axes: np.ndarray, *, where: str = "upper center") -> None:
     """One legend for all axes, above or below them: in as many columns as there is room for."""
     longest = max((len(label) for ax in axes.flat for label in ax.get_legend_handles_labels()[1]), default=0)
     column = 0.5 + 0.085 * longest  # inches, in the size of a legend's letters
-    columns = 1 if narrow else max(1, min(6, int(figure.get_figwidth() / column)))
+    columns = max(1, min(6, int(figure.get_figwidth() / column)))
     legend(figure, axes.flat, where=where, columns=columns)

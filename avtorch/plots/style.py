@@ -94,15 +94,12 @@ SHORT = {
 
 P = ParamSpec("P")
 
-WIDE, NARROW = 8.6, 4.0
-"""Widths of a page's figures [in]: on a desk, and on a phone, where the letters stay as large."""
+WIDE = 8.6
+"""Width of a page's figures [in]."""
 
 
-def panels_of(count: int, height: float, *, narrow: bool = False, wide: float = WIDE) -> tuple[Figure, list[Axes]]:
-    """Panels of that height [in] side by side, or in a `narrow` figure one above the other."""
-    if narrow:
-        figure = Figure(figsize=(NARROW, 0.6 + (0.8 if count > 1 else 0.9) * height * count), layout="constrained")
-        return figure, list(figure.subplots(count, 1, squeeze=False)[:, 0])
+def panels_of(count: int, height: float, *, wide: float = WIDE) -> tuple[Figure, list[Axes]]:
+    """Panels of that height [in] side by side."""
     figure = Figure(figsize=(wide, height), layout="constrained")
     return figure, list(figure.subplots(1, count, squeeze=False)[0])
 
@@ -112,7 +109,6 @@ def legend(
     panels: Iterable[Axes],
     *,
     where: str = "upper left",
-    narrow: bool = False,
     columns: int = 6,
     last: Sequence[str] = (),
     **look: Any,
@@ -123,7 +119,7 @@ def legend(
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     names = sorted(handles, key=lambda name: last.index(name) + 1 if name in last else 0)
-    count = max(1, min(2 if narrow else columns, len(names)))
+    count = max(1, min(columns, len(names)))
     place: Any = f"outside {where}"
     figure.legend([handles[name] for name in names], names, loc=place, ncols=count, **look)
 

@@ -1,7 +1,4 @@
-"""Drawings over time, and figures made of them: motion, beliefs, events, the quality of a log.
-
-Figures are as wide as a desk's page; with `narrow` as a phone.
-"""
+"""Drawings over time, and figures made of them: motion, beliefs, events, the quality of a log."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from avtorch.io import Log
 from avtorch.io.clock import from_start, time_label
-from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, LABELS, NARROW, ORANGE, SKY, VERMILLION, legend, styled
+from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, LABELS, ORANGE, SKY, VERMILLION, legend, styled
 
 _TRACES = {
     "leader": {"color": GREY, "linewidth": 1.2, "zorder": 2.1},
@@ -41,17 +38,7 @@ _ABOVE: Any = {"where": "upper center", "columns": 4, "last": ("vehicle changes"
 
 
 def motion(ax: Axes, time: ArrayLike, traces: Mapping[str, ArrayLike], *, quantity: str = "speed") -> Axes:
-    """Speeds, accelerations or spacings over time [s]; `traces` by name: leader, without action, with action.
-
-    Example:
-        >>> import numpy as np
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.plots import motion
-        >>> time = np.arange(0.0, 10.0, 0.1)
-        >>> ax = motion(Figure().subplots(), time, {"leader": 20 + np.sin(time), "with action": 20 + np.sin(time - 1)})
-        >>> ax.get_ylabel()
-        'speed [m/s]'
-    """
+    """Speeds, accelerations or spacings over time [s]; `traces` by name: leader, without action, with action."""
     for name, values in traces.items():
         ax.plot(np.asarray(time), np.asarray(values), label=name, **_TRACES.get(name, {}))
     if quantity == "spacing" and any(np.nanmin(np.asarray(values)) <= 0 for values in traces.values()):
@@ -124,16 +111,7 @@ def events(
     alerts: Iterable[Mapping[str, Any]] = (),
     actions: Iterable[Mapping[str, Any]] = (),
 ) -> Axes:
-    """Mark the change of the vehicle, the alerts and the actions on a time axis.
-
-    Example:
-        >>> from matplotlib.figure import Figure
-        >>> from avtorch.plots import events
-        >>> alert = {"time_s": 28.0, "detector": "stability", "why": "P(string stable) is 0.02"}
-        >>> ax = events(Figure().subplots(), change_s=26.0, alerts=[alert])
-        >>> len(ax.lines)
-        2
-    """
+    """Mark the change of the vehicle, the alerts and the actions on a time axis."""
     # an action follows its alert at once: its line is broad and pale so that the thin alert on top stays visible
     for i, time in enumerate(sorted({a["time_s"] for a in alerts})):
         ax.axvline(time, color=ORANGE, alpha=0.45, linewidth=5, zorder=1.7, label=None if i else "alert")
@@ -147,9 +125,8 @@ def events(
 def data_quality(ax: Axes, log: Log, windows: Windows = ()) -> Axes:
     """Which rows of a log serve: recorded, masked (driver, standstill); and which windows were excited.
 
-    Times are drawn from the log's start; `windows` are on its own clock, as answers have them.
+    Times are from the log's start.
     """
-    windows = from_start(windows, log.epoch_s)
     step = 1 / log.rate_hz
     time = log.elapsed
     recorded = [(time[s][0], time[s][-1] - time[s][0] + step) for s in log.segments()]
@@ -215,8 +192,20 @@ def _span(ax: Axes, ends: np.ndarray) -> Axes:
 
 
 # figures -------------------------------------------------------------------------------------------------------------
+def _stack(answer: Mapping[str, Any], rows: int, height: float, **shape: Any) -> tuple[Figure, list[Axes]]:
+    """Panels above one another over time from the log's start, with the events of an answer in each."""
+    figure = Figure(figsize=(_WIDE, height), layout="constrained")
+    axes = list(figure.subplots(rows, 1, sharex=True, squeeze=False, **shape)[:, 0])
+    # of an alarm that goes on over many windows, where it begins and is acted upon
+    alerts, change = [a for a, _ in begun(answer)], (answer.get("change") or {}).get("time_s")
+    for ax in axes:
+        events(ax, change_s=change, alerts=alerts, actions=answer.get("actions") or ())
+    axes[-1].set_xlabel(time_label(answer.get("epoch_s", 0.0)))
+    return figure, axes
+
+
 @styled
-def motion_figure(answer: Mapping[str, Any], time: ArrayLike, traces: Motion, *, narrow: bool = False) -> Figure:
+def motion_figure(answer: Mapping[str, Any], time: ArrayLike, traces: Motion) -> Figure:
     """Speeds [m/s], accelerations [m/s²] and spacings [m] of a run with and without action, over `time` (time,) [s].
 
     Example:
@@ -227,28 +216,20 @@ def motion_figure(answer: Mapping[str, Any], time: ArrayLike, traces: Motion, *,
         >>> len(motion_figure({"change": {"time_s": 4.0}}, time, traces).axes)
         2
     """
-    figure = Figure(figsize=(NARROW if narrow else _WIDE, 2.3 * len(traces) + 0.6), layout="constrained")
-    axes = figure.subplots(len(traces), 1, sharex=True, squeeze=False)[:, 0]
+    figure, axes = _stack(answer, len(traces), 2.3 * len(traces) + 0.6)
     for ax, (quantity, named) in zip(axes, traces.items(), strict=True):
-        motion(_events_of(ax, answer), time, named, quantity=quantity)
-    axes[-1].set_xlabel("time [s]")
-    legend(figure, [axes[0]], narrow=narrow, **_ABOVE)
+        motion(ax, time, named, quantity=quantity)
+    legend(figure, axes[:1], **_ABOVE)
     return figure
 
 
 @styled
 def belief_figure(
-    windows: Windows,
-    *,
-    answer: Mapping[str, Any] | None = None,
-    truth: Mapping[str, Steps] | None = None,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    log: Log | None = None,
-    narrow: bool = False,
+    answer: Mapping[str, Any], *, truth: Mapping[str, Steps] | None = None, log: Log | None = None
 ) -> Figure:
-    """Posterior bands of T_L and K_L over time; with a `log`, the quality of its rows below them.
+    """Posterior bands of T_L and K_L over time; with the `log`, the quality of its rows below them.
 
-    Times are drawn from the log's start, given by the answer's `epoch_s` or the `log`.
+    `answer` is `estimates.json`, `run.json`, or what `avtorch.results` makes of their results.
 
     Example:
         >>> from avtorch import Leader, estimate, simulate
@@ -256,27 +237,22 @@ def belief_figure(
         >>> from avtorch.results import estimates_answer
         >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
         >>> answer = estimates_answer(estimate(log, estimator="map"))
-        >>> len(belief_figure(answer["windows"], log=log).axes)  # T_L, K_L, quality of the rows
+        >>> len(belief_figure(answer, log=log).axes)  # T_L, K_L, quality of the rows
         3
     """
-    epoch_s = log.epoch_s if log is not None else (answer or {}).get("epoch_s", 0.0)
-    recorded, windows, answer = windows, from_start(windows, epoch_s), _from_start(answer, epoch_s)
-    rows = 2 + (log is not None)
-    figure = Figure(figsize=(NARROW if narrow else _WIDE, 5.8 if log is None else 6.8), layout="constrained")
-    heights = [3, 3, 1.3][:rows]
-    axes = figure.subplots(rows, 1, sharex=True, height_ratios=heights)
+    answer = _from_start(answer)
+    heights, height = ([3, 3], 5.8) if log is None else ([3, 3, 1.3], 6.8)
+    figure, axes = _stack(answer, len(heights), height, height_ratios=heights)
     for ax, name in zip(axes, ("T_L", "K_L"), strict=False):
-        _events_of(ax, answer or {})
-        belief_band(ax, windows, name, truth=(truth or {}).get(name), bounds=(bounds or {}).get(name))
+        belief_band(ax, answer["windows"], name, truth=(truth or {}).get(name))
     if log is not None:
-        data_quality(axes[-1], log, recorded)
-    axes[-1].set_xlabel(time_label(epoch_s))
-    legend(figure, axes[:2], narrow=narrow, **_ABOVE)
+        data_quality(axes[-1], log, answer["windows"])
+    legend(figure, axes[:2], **_ABOVE)
     return figure
 
 
 @styled
-def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = None, narrow: bool = False) -> Figure:
+def probability_figure(answer: Mapping[str, Any]) -> Figure:
     """P(string stable) over time, with alerts and actions; each action is labelled with the setting it chose.
 
     Example:
@@ -284,21 +260,18 @@ def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = N
         >>> from avtorch.plots import probability_figure
         >>> from avtorch.results import estimates_answer
         >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
-        >>> answer = estimates_answer(estimate(log, estimator="map"))
-        >>> len(probability_figure(answer["windows"]).axes)
+        >>> len(probability_figure(estimates_answer(estimate(log, estimator="map"))).axes)
         1
     """
-    epoch_s = (answer or {}).get("epoch_s", 0.0)
-    windows, answer = from_start(windows, epoch_s), _from_start(answer, epoch_s)
-    figure = Figure(figsize=(NARROW if narrow else _WIDE, 3.6), layout="constrained")
-    ax = figure.subplots()
-    string_probability(_events_of(ax, answer or {}), windows, actions=(answer or {}).get("actions") or ())
-    for i, action in enumerate((answer or {}).get("actions") or []):
+    answer = _from_start(answer)
+    actions: Sequence[Mapping[str, Any]] = answer.get("actions") or ()
+    figure, (ax,) = _stack(answer, 1, 3.6)
+    string_probability(ax, answer["windows"], actions=actions)
+    for i, action in enumerate(actions):
         names = " + ".join(str(s) for s in action["strategies"]) or "none"
-        ax.annotate(f"strategy {names}", (action["time_s"], 0.04 + 0.09 * (i % 4)), (4, 0), textcoords="offset points",
-                    color=GREEN, fontsize=9)  # fmt: skip
-    ax.set_xlabel(time_label(epoch_s))
-    legend(figure, [ax], narrow=narrow, **_ABOVE)
+        place = action["time_s"], 0.04 + 0.09 * (i % 4)
+        ax.annotate(f"strategy {names}", place, (4, 0), textcoords="offset points", color=GREEN, fontsize=9)
+    legend(figure, [ax], **_ABOVE)
     return figure
 
 
@@ -310,7 +283,6 @@ def overview_figure(
     *,
     truth: Mapping[str, Steps] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
-    narrow: bool = False,
 ) -> Figure:
     """A run at one glance: acceleration, belief about lag and gain, P(string stable).
 
@@ -328,23 +300,19 @@ def overview_figure(
         >>> len(overview_figure(answer, log.elapsed, traces).axes)
         4
     """
-    figure = Figure(figsize=(NARROW if narrow else _WIDE, 8.4), layout="constrained")
-    axes = figure.subplots(4, 1, sharex=True)
-    for ax in axes:
-        _events_of(ax, answer)
+    figure, axes = _stack(answer, 4, 8.4)
     motion(axes[0], time, traces["accel"], quantity="accel")
     for ax, name in zip(axes[1:3], ("T_L", "K_L"), strict=True):
         belief_band(ax, answer["windows"], name, truth=(truth or {}).get(name), bounds=(bounds or {}).get(name))
     string_probability(axes[3], answer["windows"], actions=answer["actions"])
-    axes[3].set_xlabel("time [s]")
-    legend(figure, axes, narrow=narrow, **_ABOVE)
+    legend(figure, axes, **_ABOVE)
     return figure
 
 
-def _from_start(answer: Mapping[str, Any] | None, epoch_s: float) -> dict[str, Any]:
+def _from_start(answer: Mapping[str, Any]) -> dict[str, Any]:
     """An answer with the times of windows, alerts and actions from the log's start."""
-    lists = ("windows", "alerts", "actions")
-    return {k: from_start(v, epoch_s) if k in lists and v else v for k, v in (answer or {}).items()}
+    lists = [key for key in ("windows", "alerts", "actions") if answer.get(key)]
+    return {**answer, **{key: from_start(answer[key], answer.get("epoch_s", 0.0)) for key in lists}}
 
 
 def begun(answer: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], int]]:
@@ -364,9 +332,3 @@ def begun(answer: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], int]]:
         if time not in answered:
             last[name, time] = place
     return found
-
-
-def _events_of(ax: Axes, answer: Mapping[str, Any]) -> Axes:
-    """Mark an answer's events; of an alarm that goes on over many windows, where it begins and is acted upon."""
-    change = (answer.get("change") or {}).get("time_s")
-    return events(ax, change_s=change, alerts=[a for a, _ in begun(answer)], actions=answer.get("actions") or ())

@@ -171,12 +171,12 @@ def _side(values: Mapping[str, float] | None) -> str:
 
 # both --------------------------------------------------------------------------------------------------------------
 def _ratios(what: str, ratios: Mapping[str, Quantity], table: Table, caption: str) -> Picture:
-    from avtorch.plots.ratios import ratio_figure
+    from avtorch.plots.diagnosis import ratio_figure
 
     told = "; ".join(f"{name} {_told(q)}" for name, q in ratios.items())
     return picture_of(
         "ratios",
-        lambda narrow: ratio_figure(ratios, what, narrow=narrow),
+        ratio_figure(ratios, what),
         table,
         says=f"Ratios {what} with their 90 % intervals, beside one: {told}.",
         caption=caption,

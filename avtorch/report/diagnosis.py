@@ -37,12 +37,6 @@ if TYPE_CHECKING:
 _PARTS = 12  # of the drive, rows of its table
 _ALARMS = 6  # named in the words below a picture
 _LEAST = 100  # rows of residuals from which there is something to see
-_NOT_COUNTED = {
-    "driver": "grey, the driver's hand",
-    "standstill": "hatched upwards, standstill",
-    "gap": "hatched downwards, no rows",
-    "settling": "pale, the first seconds of a drive and after a return",
-}
 _METHOD = (
     "Each hypothesis is a whole simulator and recorder, rolled out over the drive from the logged commands. Its errors "
     "are compared in short frames and bands of frequency, in each of which the noise is free. The probabilities come "
@@ -182,8 +176,7 @@ def _budget(found: Diagnosis) -> Picture | None:
             f"{'' if budget.unexplained.material else f' {counts}'}"
         )
     table = budget_table(budget, found.log.epochs_s[0])
-    draw = lambda narrow: drawings.budget_figure(found, narrow=narrow)  # noqa: E731
-    return picture_of("budget", draw, table, says=says, caption=caption, opened=True)
+    return picture_of("budget", drawings.budget_figure(found), table, says=says, caption=caption, opened=True)
 
 
 def _free_form(found: Diagnosis) -> Picture | None:
@@ -200,7 +193,7 @@ def _free_form(found: Diagnosis) -> Picture | None:
     rows = tuple(tuple(f"{x:.3g}" for x in row) for row in zip(*values, strict=True))
     return picture_of(
         "free_form",
-        lambda narrow: drawings.free_form_figure(found, narrow=narrow),
+        drawings.free_form_figure(found),
         Table("What the repaired simulator carries without a name", tuple(columns), rows, numeric=columns),
         caption="What the car's force does beyond the gain and what was named, as the repaired simulator carries it. "
         "Hatched: not driven; there nothing but its smoothness speaks, and far from the drive it goes back to K u. A "
@@ -231,7 +224,7 @@ def _drive(found: Diagnosis) -> Picture | None:
         rows.append(tuple(cells))
     return picture_of(
         "drive",
-        lambda narrow: drive.drive_figure(found, narrow=narrow),
+        drive.drive_figure(found),
         Table("The drive in parts: standard deviation of each signal, RMS of each error", tuple(columns), tuple(rows)),
         caption="Each line shows the least and the greatest value of short intervals. Simulated lines come from the "
         f"logged commands; every ten seconds a speed begins at the measured one.{_marked(axis)}{_fit(found)}",
@@ -254,12 +247,7 @@ def _fit(found: Diagnosis) -> str:
 def _marked(axis: drive.DriveTime) -> str:
     told = []
     if axis.uncounted:
-        each = [
-            f"{words} {sum(x.end - x.begin for x in axis.uncounted if x.why == why):.0f} s"
-            for why, words in _NOT_COUNTED.items()
-            if any(x.why == why for x in axis.uncounted)
-        ]
-        told.append(f" Shaded: what did not count ({'; '.join(each)}).")
+        told.append(f" Shaded: {sum(x.end - x.begin for x in axis.uncounted):.0f} s that did not count.")
     if len(axis.begins) > 1:
         told.append(f" {len(axis.begins)} logs, one behind the other.")
     if axis.onset is not None:
@@ -280,7 +268,7 @@ def _road(found: Diagnosis) -> Picture | None:
         which = "The beginning of the drive; nothing was named that another stretch would show better."
     return picture_of(
         "road",
-        lambda narrow: drawings.road_figure(found, narrow=narrow),
+        drawings.road_figure(found),
         caption=f"{which} Simulated lines: the simulator gets the logged commands and never the measured acceleration; "
         "its speed starts at the measured one.",
     )
@@ -294,7 +282,7 @@ def _where(found: Diagnosis) -> Picture | None:
         return None
     return picture_of(
         "where",
-        lambda narrow: drawings.where_figure(found, narrow=narrow),
+        drawings.where_figure(found),
         caption="Where the blue line is above the grey ground, the effect acts more than its share of the drive.",
     )
 
@@ -303,7 +291,7 @@ def _which(found: Diagnosis) -> Picture:
     bars = ", ".join(f"{c.name.replace('+', ' + ')} {sentences.number(c.probability)}" for c in found.candidates[:3])
     return picture_of(
         "which",
-        lambda narrow: drawings.which_figure(found, narrow=narrow),
+        drawings.which_figure(found),
         candidate_table(found),
         says=f"Bars of the probability of each hypothesis: {bars}.",
         caption="Blue, and bold in the table: the alias set, which this log cannot distinguish from the verdict. "
@@ -328,7 +316,7 @@ def _shrinkage(found: Diagnosis) -> Section:
         return Section(title, (how,), tables=(measures,))
     drawn = picture_of(
         "shrinkage",
-        lambda narrow: drawings.shrinkage_figure(found, narrow=narrow),
+        drawings.shrinkage_figure(found),
         measures,
         caption="Bold in the table: the measure that decides.",
         opened=True,
@@ -350,7 +338,7 @@ def _setting(found: Diagnosis) -> Section:
 def _next(experiment: Experiment) -> Picture:
     return picture_of(
         "next",
-        lambda narrow: drive.experiment_figure(experiment, narrow=narrow),
+        drive.experiment_figure(experiment),
         caption="The commands row by row are in manoeuvre.csv. A command holds until the next row; the speed is the "
         "prediction of the most probable hypothesis. Use a level road if there is one.",
     )
@@ -399,15 +387,7 @@ def _residuals(found: Diagnosis) -> Section:
             "chance does, follows the command in a way that the simulator does not.",
         )
     )
-    if left.spectrum(last) is not None:
-        pictures.append(
-            picture_of(
-                "residual-frequency",
-                drive.residual_figure(found, "frequency"),
-                caption="Against frequency: power averaged over windows of 20 s; bands are 90 %.",
-            )
-        )
-    return Section(title, _what_is_left(left, both), (_residual_over_time(found, left, both),), tuple(pictures))
+    return Section(title, _what_is_left(left, both), small=pictures)
 
 
 def _what_is_left(left: Residuals, both: Mapping[str, FloatArray]) -> tuple[str, ...]:
@@ -440,26 +420,6 @@ def _apart(bins: BinnedMeans) -> bool:
     """Whether more bins than chance would exclude 0: of 90 % intervals, one in ten does."""
     known = np.isfinite(bins.low)
     return int(((bins.low > 0) | (bins.high < 0))[known].sum()) > max(2, 0.3 * int(known.sum()))
-
-
-def _residual_over_time(found: Diagnosis, left: Residuals, both: Mapping[str, FloatArray]) -> Picture:
-    columns = ("part of the drive [s]", *(f"{what} {label} [m/s²]" for label in both for what in ("mean", "SD")))
-    rows = [
-        (
-            f"{left.time[part[0]]:.0f} to {left.time[part[-1]]:.0f}",
-            *(f"{size:.3f}" for residual in both.values() for size in (residual[part].mean(), residual[part].std())),
-        )
-        for part in np.array_split(np.arange(len(left.time)), _PARTS)
-    ]
-    judged = list(both.values())[-1]
-    beyond = f"{100 * float(np.mean(np.abs(judged) > left.usual(judged))):.1f} %"
-    return picture_of(
-        "residual-time",
-        lambda narrow: drive.residual_time_figure(found, narrow=narrow),
-        Table("Residual in parts of the drive", columns, tuple(rows), numeric=columns[1:]),
-        caption="Grey ground: where 99 % of a steady normal residual with the quartiles of the last line would lie; "
-        f"{beyond} lie beyond.",
-    )
 
 
 def _residual_against(

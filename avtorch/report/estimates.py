@@ -87,7 +87,7 @@ def _tone(windows: Sequence[Mapping[str, Any]], spread_over_sd: Mapping[str, flo
 def _belief(answer: Mapping[str, Any], log: Log) -> Picture:
     return picture_of(
         "belief",
-        lambda narrow: belief_figure(answer["windows"], answer=answer, log=log, narrow=narrow),
+        belief_figure(answer, log=log),
         window_table(from_start(answer["windows"], answer["epoch_s"])),
         caption="Grey: a window that excited too little, or did not converge; the belief before it is carried over.",
     )
@@ -96,7 +96,7 @@ def _belief(answer: Mapping[str, Any], log: Log) -> Picture:
 def _probability(answer: Mapping[str, Any]) -> Picture:
     return picture_of(
         "probability",
-        lambda narrow: probability_figure(answer["windows"], answer=answer, narrow=narrow),
+        probability_figure(answer),
         probability_table(from_start(answer["windows"], answer["epoch_s"])),
         caption="Known at the end of each window: a dot, larger and red below the target.",
     )

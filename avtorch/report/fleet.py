@@ -179,14 +179,12 @@ def _picture(answer: Answer) -> Picture | None:
     # draws, and needs matplotlib
     from avtorch.plots.fleet import FEW, fleet_figure
 
-    each = "each with its 90 % intervals" if len(known) <= FEW else "a square's area is its number of cars"
-    ranks = "; numbers are ranks" if len(known) <= FEW else ""
+    each, ranks = (", each with its 90 % intervals", "; numbers are ranks") if len(known) <= FEW else ("", "")
     caption = (
-        f"First: cars by lag and gain, {each}; red: below the target, orange: unlike its siblings or its own past, "
+        f"First: cars by lag and gain{each}; red: below the target, orange: unlike its siblings or its own past, "
         f"blue: the others{ranks}. Second: the share of cars up to each P(string stable)."
     )
-    draw = lambda narrow: fleet_figure(answer, narrow=narrow)  # noqa: E731
-    return picture_of("fleet", draw, stability_table(answer), caption=caption)
+    return picture_of("fleet", fleet_figure(answer), stability_table(answer), caption=caption)
 
 
 def _method(answer: Answer) -> list[str]:

@@ -11,7 +11,7 @@ import hashlib
 import io
 import platform
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from importlib.resources import files
@@ -109,18 +109,16 @@ _COLOURS = {
 }
 """The style's name for each colour of `avtorch.plots.style`."""
 _PX_A_POINT = 1.5
+_LEAST = 0.76  # of the width on a desk, below which letters could not be read
 _MOST = 40  # rows of a table of lines
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture as `wide` and `narrow` SVG, for a desk and for a phone; `narrow` is empty where one serves both.
+    """A picture as SVG; `says`: what it shows, in words; `caption`; `tables`: its numbers, shown at once where
+    `opened`."""
 
-    `says`: what it shows, in words; `caption`; `tables`: its numbers, shown at once where `opened`.
-    """
-
-    wide: Markup
-    narrow: Markup
+    svg: Markup
     says: str
     caption: str = ""
     tables: tuple[Table, ...] = ()
@@ -172,7 +170,7 @@ class Page:
         script = Markup("\n" + self.script) if self.script else ""
         # thousands of dots are an image within the page
         pictures = [picture for section in (page.lead, *page.sections) for picture in section.pictures if picture]
-        policy = "; img-src data:" if any("<image" in picture.wide for picture in pictures) else ""
+        policy = "; img-src data:" if any("<image" in picture.svg for picture in pictures) else ""
         policy += f"; script-src 'sha256-{_digest(script)}'" if script else ""
         frame = {"style": Markup(text_of("style.css")), "origin": origin or Origin(), "versions": versions()}
         return _template("page.html").render(page=page, policy=Markup(policy), script=script, **frame)
@@ -188,24 +186,18 @@ def written(text: str, folder: str | PathLike[str], name: str) -> Path:
 
 def picture_of(
     name: str,
-    draw: Figure | Callable[[bool], Figure],
+    figure: Figure,
     *tables: Table,
     says: str = "",
     caption: str = "",
     opened: bool = False,
 ) -> Picture:
-    """What `draw` makes of False, for a desk, and of True, for a phone; or a figure for both, as wide as a phone.
-
-    Where they are not given, what it says and its tables are those of its lines.
-    """
+    """A figure for the page; where they are not given, what it says and its tables are those of its lines."""
     # draws, and needs matplotlib
     from avtorch.plots.style import words_of
 
-    figure = draw(False) if callable(draw) else draw
     says = says or words_of(figure)
-    wide = inline_svg(f"{name}-wide", figure, says)
-    narrow = inline_svg(f"{name}-narrow", draw(True), says) if callable(draw) else Markup("")
-    return Picture(wide, narrow, says, caption, tables or _tables_of(figure), opened)
+    return Picture(inline_svg(name, figure, says), says, caption, tables or _tables_of(figure), opened)
 
 
 def _tables_of(figure: Figure) -> tuple[Table, ...]:
@@ -251,11 +243,13 @@ def inline_svg(name: str, figure: Figure, says: str) -> Markup:
     text = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", text)
     text = re.sub(r"((?:fill|stroke): )(#[0-9a-f]{6})", _colour, text)
     text = re.sub(r"-?\d+\.\d{3,}", lambda m: f"{float(m[0]):.2f}", text)
-    # letters are of one size on a desk, whatever the width of the figure
-    width = round(_PX_A_POINT * 72 * figure.get_figwidth())
-    opening = Markup('<svg class="picture" role="img" aria-label="{}" {} style="max-width: {}px">')
+    # letters are of one size on a desk, whatever the width of the figure; a phone shows a part of a wide one
+    most = _PX_A_POINT * 72 * figure.get_figwidth()
+    opening = Markup(
+        '<svg class="picture" role="img" aria-label="{}" {} style="max-width: {:.0f}px; min-width: {:.0f}px">'
+    )
     # matplotlib escapes what it writes
-    return opening.format(printable(says), Markup(view[0]), width) + Markup(text)
+    return opening.format(printable(says), Markup(view[0]), most, _LEAST * most) + Markup(text)
 
 
 def _colour(found: re.Match[str]) -> str:

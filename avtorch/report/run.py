@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,15 +28,8 @@ _MOST = 40  # rows of the story
 _DOTS, _POINTS = 150, 301  # draws of a cloud, points of a map's axis: more would make a page of megabytes
 
 
-@dataclass(frozen=True)
-class Regions:
-    """Beliefs in the stability regions of settings, as `region_figure` draws them.
-
-    `settings`: (name, setting) pairs; `clouds`: draws of T_L [s] and K_L, (draw,) each, by name.
-    """
-
-    settings: Sequence[tuple[str, Mapping[str, Any]]]
-    clouds: Mapping[str, tuple[ArrayLike, ArrayLike]]
+Regions = tuple[Sequence[tuple[str, Mapping[str, Any]]], Mapping[str, tuple[ArrayLike, ArrayLike]]]
+"""Settings by name, and draws of T_L [s] and K_L, (draw,) each, by name, as `region_figure` takes them."""
 
 
 def run_html(
@@ -56,12 +48,12 @@ def run_html(
     """
     overview = picture_of(
         "overview",
-        lambda narrow: overview_figure(answer, time, traces, truth=truth, bounds=bounds, narrow=narrow),
+        overview_figure(answer, time, traces, truth=truth, bounds=bounds),
         window_table(answer["windows"]),
         caption="Blue: avtorch's belief, or the run with its actions. Dashed: the truth. Hatched: the bounds the "
         "controller was designed for.",
     )
-    motion = picture_of("motion", lambda narrow: motion_figure(answer, time, traces, narrow=narrow))
+    motion = picture_of("motion", motion_figure(answer, time, traces))
     story = story_table(answer)
     more = 1 + len(begun(answer)) + len(answer["actions"]) - len(story.rows)
     page = Page(
@@ -174,10 +166,11 @@ def _regions(regions: Regions | None, truth: Mapping[str, Steps] | None) -> tupl
     if regions is None:
         return ()
     now = None if truth is None else (float(truth["T_L"][-1][1]), float(truth["K_L"][-1][1]))
-    clouds = {name: (np.asarray(T)[:_DOTS], np.asarray(K)[:_DOTS]) for name, (T, K) in regions.clouds.items()}
+    settings, draws = regions
+    clouds = {name: (np.asarray(T)[:_DOTS], np.asarray(K)[:_DOTS]) for name, (T, K) in draws.items()}
     drawn = picture_of(
         "region",
-        lambda narrow: region_figure(regions.settings, clouds, truth=now, narrow=narrow, points=_POINTS),
+        region_figure(settings, clouds, truth=now, points=_POINTS),
         _shares(regions, now),
         caption="A dot is a draw of the belief. String stable is what lies in the blue.",
     )
@@ -186,15 +179,16 @@ def _regions(regions: Regions | None, truth: Mapping[str, Steps] | None) -> tupl
 
 def _shares(regions: Regions, now: tuple[float, float] | None) -> Table:
     """Of each belief, T_L and K_L, and the share that is string stable under each setting."""
-    columns = ("vehicle", "T_L [s] (90 %)", "K_L (90 %)", *(f"string stable {name}" for name, _ in regions.settings))
+    settings, clouds = regions
+    columns = ("vehicle", "T_L [s] (90 %)", "K_L (90 %)", *(f"string stable {name}" for name, _ in settings))
     rows = []
-    for name, (T, K) in regions.clouds.items():
+    for name, (T, K) in clouds.items():
         some = [np.asarray(values, dtype=float) for values in (T, K)]
         told = [f"{x.mean():.3f} ({np.quantile(x, 0.05):.2f} to {np.quantile(x, 0.95):.2f})" for x in some]
-        rows.append((name, *told, *(f"{100 * _stable(setting, *some):.0f} %" for _, setting in regions.settings)))
+        rows.append((name, *told, *(f"{100 * _stable(setting, *some):.0f} %" for _, setting in settings)))
     if now is not None:
         one = [np.array([x]) for x in now]
-        held = ("yes" if _stable(setting, *one) else "no" for _, setting in regions.settings)
+        held = ("yes" if _stable(setting, *one) else "no" for _, setting in settings)
         rows.append(("truth", f"{now[0]:g}", f"{now[1]:g}", *held))
     return Table("The beliefs, and the share of each that is string stable", columns, tuple(rows))
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy.stats import ks_2samp, kstest
+from scipy.stats import kstest
 
 from avtorch.inference.arviz_export import shown_unit
 from avtorch.plots.posteriors import ChosenWindows, validation_figures
@@ -43,24 +43,21 @@ def validation_html(found: Validation, *, origin: Origin | None = None) -> str:
 
 def _sections(found: Validation) -> list[Section]:
     """A picture each, with its table; the exact probabilities only where there is quadrature."""
-    wide, phone = (validation_figures(found, narrow=narrow) for narrow in (False, True))
+    figures = validation_figures(found)
     chosen = ChosenWindows(found)
     parts = {
         "agreement": ("Window by window", _windows),
         "marginals": ("Marginals", _marginals),
         "joint": ("Lag and gain together", _correlations),
-        "ranks": ("Ranks", _ranks),
         "ecdf": ("Exact probabilities below the draws", _ecdfs),
     }
     return [
         Section(
             title,
-            pictures=(
-                picture_of(name, lambda narrow, f=f"{name}.png": (phone if narrow else wide)[f](), table(chosen)),
-            ),
+            pictures=(picture_of(name, figures[f"{name}.png"](), table(chosen)),),
         )
         for name, (title, table) in parts.items()
-        if f"{name}.png" in wide
+        if f"{name}.png" in figures
     ]
 
 
@@ -147,20 +144,6 @@ def _correlations(chosen: ChosenWindows) -> Table:
         told = {m: f"{np.corrcoef(x[:, pair].numpy().T)[0, 1]:+.2f}" for m, x in chosen.draws(row).items()}
         rows.append((str(window.number), *(told.get(method, "") for method in columns[1:])))
     return Table("Correlation of lag and gain", columns, tuple(rows), numeric=columns[1:])
-
-
-def _ranks(chosen: ChosenWindows) -> Table:
-    """A row a window and parameter: how probable so large a distance from the pool of the others is, by group."""
-    groups = tuple(chosen.groups(0, 0))
-    rows = []
-    for row, window in enumerate(chosen.windows):
-        for i, name in enumerate(chosen.validation.names):
-            drawn = chosen.groups(row, i)
-            others = {g: np.concatenate([x for other, x in drawn.items() if other != g]) for g in drawn}
-            found = (f"{ks_2samp(drawn[g], others[g])[1]:.2g}" if g in drawn else "" for g in groups)
-            rows.append((f"{window.number}: {name}", *found))
-    columns = ("window and parameter", *groups)
-    return Table("p-value of each group beside the others (Kolmogorov-Smirnov)", columns, tuple(rows), columns[1:])
 
 
 def _ecdfs(chosen: ChosenWindows) -> Table:

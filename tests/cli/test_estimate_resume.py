@@ -62,7 +62,7 @@ def interrupted(
         assert main([*line, "--out", str(out)]) == 130
     told = capsys.readouterr().err
     assert told.count("\n") == 1
-    assert f"interrupted; no answer was written; finished windows are kept in {out / WINDOWS}" in told
+    assert f"interrupted: finished windows are kept in {out / WINDOWS}" in told
     assert "the same command resumes there" in told
     return line, out
 

@@ -60,6 +60,7 @@ def test_a_map_of_an_earlier_log_does_not_stay_beside_an_answer_without_one(tmp_
     left = [out / name for name in ("pedal_map.csv", "accel_map.csv", "brake_map.csv", "pedal_map.png")]
     for path in (*left, kept):
         path.write_text("of the earlier log\n")
+    (out / "estimates.json").write_text(json.dumps({"files": {path.name: "" for path in left}}))
     run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02))
     run.log().write(tmp_path / "lap.csv")
     assert main(["estimate", str(tmp_path / "lap.csv"), "--estimator", "map", "--quiet", "--out", str(out)]) == 0

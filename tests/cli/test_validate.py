@@ -41,7 +41,7 @@ def test_synthetic_windows(short_nuts: None, tmp_path: Path, capsys: pytest.Capt
     assert "agree: " in told
     assert "For ArviZ: sgld.nc, nuts.nc, quadrature.nc" in told
     written = {p.name for p in out.iterdir()}
-    pictures = {"marginals.png", "ranks.png", "ecdf.png", "agreement.png"}
+    pictures = {"marginals.png", "ecdf.png", "agreement.png"}
     assert {"validation.json", "sgld.nc", "nuts.nc", "quadrature.nc", *pictures} <= written
     answer = json.loads((out / "validation.json").read_text(encoding="utf-8"))
     assert answer["schema"] == "avtorch.validation/1"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 import re
@@ -201,7 +200,6 @@ def test_the_interpreter_is_left_as_it_was(tmp_path: Path) -> None:
 
 
 def test_what_is_not_installed_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    there = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *rest: None if n == "pythonfmu" else there(n, *rest))
+    monkeypatch.setitem(sys.modules, "pythonfmu.builder", None)
     with pytest.raises(InputError, match=re.escape("pip install 'avtorch[fmu]'")):
         write_fmu(plant(), tmp_path / "car.fmu")

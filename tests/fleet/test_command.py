@@ -108,4 +108,4 @@ def test_a_file_in_place_of_the_folder_is_refused(here: Path, capsys: pytest.Cap
     write_fleet(here / "logs", {"red": 0.3})
     (here / "out").write_text("a file")
     assert main(["fleet", "logs", "--out", "out"]) == 2
-    assert "out is a file; needs a folder" in capsys.readouterr().err
+    assert "out: cannot be made" in capsys.readouterr().err

@@ -263,7 +263,7 @@ LEADERS.append(b"Vehicle_order,Audi(A8),BMW(X5)\nRows,24\n" + text(ZALAZONE))
 def test_damaged_recordings(folder: Path, raw: bytes, event: int | None, vehicle: int | None) -> None:
     path = folder / "leader.csv"
     path.write_bytes(raw)
-    leader = outcome(lambda: read_leader(path, event=event, vehicle=vehicle, duration=None))
+    leader = outcome(lambda: read_leader(path, event=event, vehicle=vehicle))
     log = outcome(lambda: read_following(path, event=event, vehicle=vehicle))
     found = [x for x in (leader, log) if x is not None]
     numbers = numbers_in(raw) if found else set()

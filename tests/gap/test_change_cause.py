@@ -24,8 +24,7 @@ from avtorch.gap.result.cause_of_change import _of_effect, cause_of_change
 from avtorch.gap.result.comparison import ChangeCause, ChangePart, Comparison, detectable_text
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.io import Log
-from avtorch.report import comparison_html
-from avtorch.report.comparison import comparison_tables
+from avtorch.report.comparison import comparison_html, comparison_tables
 from benchmarks.blindtest import DrivePlan, draw_car, simulate
 from tests.bars import LEVEL, student
 from tests.gap.cars import log_of

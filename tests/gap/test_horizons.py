@@ -10,7 +10,7 @@ import pytest
 import avtorch
 from avtorch.gap import DeadTime, plant
 from avtorch.gap.result.diagnosis import Diagnosis
-from avtorch.report import report_html
+from avtorch.report.diagnosis import report_html
 from tests.gap.records import log_of
 
 

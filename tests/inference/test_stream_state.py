@@ -193,12 +193,12 @@ def test_symlinks_folders_and_fifos_are_refused(saved: BeliefStream, tmp_path: P
     link.symlink_to(path)
     folder.mkdir()
     os.mkfifo(fifo)
-    for place, told in ((link, "a symbolic link"), (folder, "a directory"), (fifo, "a named pipe")):
+    for place, told in ((link, "a symbolic link"), (folder, "a directory"), (fifo, "no regular file")):
         with pytest.raises(InputError, match=f"{place.name}: is {told}"):
             new().load(place)
     assert path.read_bytes() == before
     assert link.is_symlink()
-    with pytest.raises(InputError, match="is a device"):
+    with pytest.raises(InputError, match="is no regular file"):
         new().load("/dev/zero")
     with pytest.raises(InputError, match="missing: no such file"):
         new().load(tmp_path / "missing")

@@ -140,11 +140,11 @@ FILES = {
     "short_row": (b"time,accel_cmd,speed\n0,1,2\n0.1,1\n", "row 2 (line 3): has 2 cells where the header has 3"),
     "long_row": (b"time,accel_cmd,speed\n0,1,2,3\n0.1,1,2\n", "row 1 (line 2): has 4 cells"),
     "torn_quote": (b'time,accel_cmd,speed\n0,"1,2\n0.1,1,2\n', "cannot be split into cells"),
-    "binary": (bytes(range(1, 256)) * 8, "is not UTF-8 text"),
-    "zero_bytes": (b"time,accel_cmd,speed\n0,1,\0\n", "line 2: holds a zero byte"),
+    "binary": (bytes(range(1, 256)) * 8, "is no text"),
+    "zero_bytes": (b"time,accel_cmd,speed\n0,1,\0\n", "is no text"),
     "damaged_gzip": (b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x00\x03abc", "gzip data"),
     "torn_gzip": (gzip.compress(b"time,accel_cmd,speed\n0,1,2\n0.1,1,2\n")[:-12], "ends inside its gzip data"),
-    "odd_utf16": ("time,speed\n0,1\n".encode("utf-16")[:-1], "is not UTF-16 text"),
+    "odd_utf16": ("time,speed\n0,1\n".encode("utf-16")[:-1], "is no text"),
     "torn_parquet": (b"PAR1" + b"\x00" * 100, "damaged Parquet"),
 }
 

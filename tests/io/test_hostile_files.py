@@ -77,12 +77,12 @@ def test_a_message_is_one_printable_line_whatever_is_in_it() -> None:
 @pytest.mark.parametrize("read", READERS.values(), ids=READERS)
 def test_only_regular_files_are_opened(read: Callable[[Path], object], tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.csv")
-    refused(lambda: read(tmp_path / "pipe.csv"), "is a named pipe")
-    refused(lambda: read(Path("/dev/zero")), "/dev/zero: is a device")
+    refused(lambda: read(tmp_path / "pipe.csv"), "is no regular file")
+    refused(lambda: read(Path("/dev/zero")), "/dev/zero: is no regular file")
     refused(lambda: read(tmp_path), "is a directory")
     with socket.socket(socket.AF_UNIX) as end:
         end.bind(str(tmp_path / "end.csv"))
-        refused(lambda: read(tmp_path / "end.csv"), "is a socket")
+        refused(lambda: read(tmp_path / "end.csv"), "cannot be read")
 
 
 def test_a_link_to_a_log_is_a_log(tmp_path: Path) -> None:
@@ -135,7 +135,7 @@ def test_a_mapping_is_no_link(tmp_path: Path) -> None:
     assert "root:x" not in refused(lambda: Log.read(tmp_path / "lap.csv"), "lap.toml: is a symbolic link")
     (tmp_path / "lap.toml").unlink()
     os.mkfifo(tmp_path / "lap.toml")
-    refused(lambda: Log.read(tmp_path / "lap.csv"), "lap.toml: is a named pipe")
+    refused(lambda: Log.read(tmp_path / "lap.csv"), "lap.toml: is no regular file")
 
 
 MAPPINGS = {
@@ -179,7 +179,7 @@ TEXTS = {
     "row": (HEAD.encode() + b'"\n",' * 400_000, "a row has more than 1,000,000 characters"),
     "cell": (HEAD.encode() + b"0,0," + b"9" * 10_000_000, "a row has more than 1,000,000 characters"),
     "quoted_cell": (HEAD.encode() + b'0,0,"' + b"9" * 500_000 + b'"', "line 2: cannot be split into cells"),
-    "returns": (b"time,accel_cmd,speed\r0,1,2\r0.1,\0,2\r", "line 3: holds a zero byte"),
+    "returns": (b"time,accel_cmd,speed\r0,1,2\r0.1,\0,2\r", "is no text"),
 }
 
 
@@ -375,7 +375,7 @@ def test_arrays_that_are_none() -> None:
 
 def test_a_plain_table_reads_the_columns_it_is_asked_for(tmp_path: Path) -> None:
     path = write(tmp_path / "lap.csv", GOOD)
-    table = read_table(path, wanted=lambda names: ["speed"])
+    table = read_table(path, wanted=["speed"])
     assert table.rows == 200
     assert np.array_equal(table.numbers("speed"), GOOD["speed"])
     with pytest.raises(KeyError):

@@ -11,7 +11,6 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.io import Log, check, read_following, read_leader
-from avtorch.io.leaders import JOIN_SPEED_MPS
 from avtorch.io.us06 import US06_SPEED_MPS
 
 ZALA = """Date,8,10,2019
@@ -85,8 +84,6 @@ def test_plain_form(tmp_path):
         ("event,time,lead_speed\n1,0,3\n1.5,0.1,3\n", {}, "row 2 (line 3), column 'event': is 1.5"),
         ("event,time,lead_speed\n1,0,3\n2,0,3\n1,0.1,3\n", {"event": 1}, "row 3 (line 4), column 'event'"),
         ("event,time,lead_speed\n1,0,3\n2,0,3\n2,0.1,x\n", {"event": 2}, "row 3 (line 4), column 'lead_speed'"),
-        ("event,time,lead_speed\n1,0,3\n1,0.1,3\n", {"duration": -1.0}, "a positive number of seconds"),
-        ("event,time,lead_speed\n1,0,3\n1,0.1,3\n", {"duration": 5.0}, "no further event"),
         ("Time,SpeedDoppler1\n0,1\n0.1,1\n", {"vehicle": 2}, "vehicles: 1"),
         ("Time,Velocity\n0,1\n0.1,999\n", {}, "column 'Velocity': is 277.5"),
     ],
@@ -96,7 +93,7 @@ def test_a_bad_leader_file(tmp_path, text, options, what):
     path.write_text(text)
     with pytest.raises(InputError, match=re.escape(what)) as fault:
         read_leader(path, **options)
-    assert str(fault.value).startswith(str(path)) or "duration" in str(fault.value)
+    assert str(fault.value).startswith(str(path))
 
 
 def test_us06_is_the_published_schedule(data_dir):
@@ -161,24 +158,6 @@ def test_spacing_belongs_to_the_vehicle_behind(data_dir):
 def test_i24_is_converted(data_dir):
     leader = read_leader(data_dir / "i24" / "2021-03-12-22-20-57_0.csv")
     assert leader.speed[0] == pytest.approx(58.7268 / 3.6)
-
-
-@pytest.mark.slow
-def test_joined_events_follow_the_stated_rule(data_dir):
-    path = data_dir / "ngsim" / "events_000_249.csv"
-    leader = read_leader(path, duration=120)
-    events = [int(number) for number in leader.name.removeprefix("NGSIM ").split("+")]
-    assert leader.time[-1] >= 120
-    assert len(set(events)) == len(events) > 2
-    assert all(str(event) in leader.note for event in events)
-    np.testing.assert_allclose(np.diff(leader.time), 0.1, atol=1e-9)
-    # a joint adds at most the tolerance to the change of one sample
-    parts = [read_leader(path, event=event) for event in events]
-    natural = max(np.abs(np.diff(part.speed)).max() for part in parts)
-    assert np.abs(np.diff(leader.speed)).max() <= natural + JOIN_SPEED_MPS + 1e-9
-    # every stretch is as recorded
-    np.testing.assert_array_equal(leader.speed[: len(parts[0].speed)], parts[0].speed)
-    np.testing.assert_array_equal(leader.speed[-10:], parts[-1].speed[-10:])
 
 
 def test_the_genesis_laps_as_logs(data_dir):

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from avtorch.errors import InputError
-from avtorch.io import Log, check, held
+from avtorch.io import Log, check
+from avtorch.io.assemble import held
 
 from .drives import drive, write
 

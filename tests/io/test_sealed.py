@@ -14,40 +14,30 @@ import numpy as np
 import pytest
 
 from avtorch.errors import InputError
-from avtorch.io import Damaged, fingerprint, read_sealed, read_sealed_bytes, write_sealed
+from avtorch.io import Damaged, fingerprint, read_sealed_bytes, write_sealed
 
 SCHEMA = "avtorch.test/1"
 OF = {"logs": ["drive.csv"], "pairs": True}
-CONTENT = {
-    "fits": [{"name": "dead_time", "z": [0.1, -1e-300, 5e-324], "onset": None}, {"ü\udc80": "\u2028"}],
-    "n": 2**70,
-}
+CONTENT = b"{\n\x00\xff"
 
 
 def test_content_comes_back_to_the_bit(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "state.json"
     write_sealed(path, CONTENT, schema=SCHEMA, of=OF)
-    assert read_sealed(path, schema=SCHEMA) == (OF, CONTENT)
-    # anyone can read it: JSON from the second line on
-    assert json.loads(path.read_text(encoding="utf-8").split("\n", 2)[2]) == CONTENT
-    write_sealed(path, b"{\n\x00\xff", schema=SCHEMA, of=OF)
-    assert read_sealed_bytes(path, schema=SCHEMA) == (OF, b"{\n\x00\xff")
+    assert read_sealed_bytes(path, schema=SCHEMA) == (OF, CONTENT)
 
 
-@pytest.mark.parametrize("binary", [False, True])
-def test_every_byte_counts(tmp_path: Path, binary: bool) -> None:
+def test_every_byte_counts(tmp_path: Path) -> None:
     """Each byte changed; and left out, doubled, or the last one that is left: none of it is read."""
     path = tmp_path / "state"
-    content: Any = b"some bytes\n" if binary else {"T_L": 0.3, "rows": [1, 2]}
-    write_sealed(path, content, schema=SCHEMA, of={"a": 1})
+    write_sealed(path, b"some bytes\n", schema=SCHEMA, of={"a": 1})
     whole = path.read_bytes()
-    read = read_sealed_bytes if binary else read_sealed
     for i, byte in enumerate(whole):
         more = [whole[:i] + whole[i + 1 :], whole[:i] + whole[i : i + 1] + whole[i:], whole[:i]]
         for other in (whole[:i] + bytes([byte ^ 1]) + whole[i + 1 :], more[i % 3]):
             path.write_bytes(other)
             with pytest.raises(Damaged, match=r"^\S+state: .*; remove it, or use another folder$"):
-                read(path, schema=SCHEMA)
+                read_sealed_bytes(path, schema=SCHEMA)
 
 
 def forged(body: bytes) -> bytes:
@@ -55,23 +45,16 @@ def forged(body: bytes) -> bytes:
     return hashlib.sha256(body).hexdigest().encode() + b"\n" + body
 
 
-HEAD = b'{"schema": "avtorch.test/1", "of": {}}\n'
-
-
 @pytest.mark.parametrize(
     "body",
     [
         b"",
         b"}",
-        HEAD,
         b'{"schema": "avtorch.test/1", "of": {}, "more": 2}\n1',
         b'{"schema": "avtorch.test/1", "of": []}\n1',
-        HEAD + b"NaN",
-        HEAD + b"-Infinity",
-        HEAD + b"9" * 100_000,
-        HEAD + b"[" * 100_000 + b"]" * 100_000,
-        HEAD + b'"\xff"',
-        HEAD + b"1 and more",
+        b"[" * 100_000 + b"]" * 100_000,
+        b'"\xff"',
+        b"9" * 100_000,
     ],
     ids=lambda body: body[-40:].decode("latin-1"),
 )
@@ -79,26 +62,23 @@ def test_a_right_checksum_over_nonsense_helps_nothing(tmp_path: Path, body: byte
     path = tmp_path / "state"
     path.write_bytes(forged(body))
     with pytest.raises(Damaged):
-        read_sealed(path, schema=SCHEMA)
-    if not body.startswith(HEAD):
-        with pytest.raises(Damaged):
-            read_sealed_bytes(path, schema=SCHEMA)
+        read_sealed_bytes(path, schema=SCHEMA)
 
 
 def test_another_schema_and_too_much_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "state"
     write_sealed(path, CONTENT, schema="avtorch.other/1", of={})
     with pytest.raises(Damaged, match=r"holds avtorch\.other/1, needs avtorch\.test/1"):
-        read_sealed(path, schema=SCHEMA)
+        read_sealed_bytes(path, schema=SCHEMA)
     with pytest.raises(Damaged, match="is larger than"):
-        read_sealed(path, schema="avtorch.other/1", most=100)
+        read_sealed_bytes(path, schema="avtorch.other/1", most=100)
     path.write_text(json.dumps({"fits": []}))
     with pytest.raises(Damaged, match="changed by hand or of an earlier avtorch: its checksum is wrong; do this"):
-        read_sealed(path, schema=SCHEMA, remedy="do this")
+        read_sealed_bytes(path, schema=SCHEMA, remedy="do this")
 
 
 def test_only_regular_files_are_read(tmp_path: Path) -> None:
-    """A FIFO would keep its reader waiting, a device would never end, a symlink leads elsewhere."""
+    """A FIFO would keep its reader waiting, no regular file would never end, a symlink leads elsewhere."""
     real = tmp_path / "real"
     write_sealed(real, CONTENT, schema=SCHEMA, of={})
     before = real.read_bytes()
@@ -108,25 +88,25 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
     folder.mkdir()
     for path, kind in (
         (link, "a symbolic link"),
-        (fifo, "a named pipe"),
+        (fifo, "no regular file"),
         (folder, "a directory"),
-        (Path("/dev/zero"), "a device"),
+        (Path("/dev/zero"), "no regular file"),
     ):
         with pytest.raises(InputError, match=f"{path.name}: is {kind}") as caught:
-            read_sealed(path, schema=SCHEMA)
+            read_sealed_bytes(path, schema=SCHEMA)
         assert not isinstance(caught.value, Damaged)
     assert real.read_bytes() == before
     with pytest.raises(InputError, match="missing: no such file; remove it"):
-        read_sealed(tmp_path / "missing", schema=SCHEMA)
+        read_sealed_bytes(tmp_path / "missing", schema=SCHEMA)
     for path in (tmp_path / ("x" * 300), tmp_path / "zero\0byte", real / "inside"):
         with pytest.raises(InputError, match="cannot be read"):
-            read_sealed(path, schema=SCHEMA)
+            read_sealed_bytes(path, schema=SCHEMA)
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace", "chmod"])
 def test_a_failed_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str) -> None:
     path = tmp_path / "state"
-    write_sealed(path, 1, schema=SCHEMA, of={})
+    write_sealed(path, b"1", schema=SCHEMA, of={})
     before = path.read_bytes()
 
     def full(*_: Any, **__: Any) -> Any:
@@ -134,13 +114,13 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytes
 
     monkeypatch.setattr(os, call, full)
     with pytest.raises(InputError, match="state: cannot be written"):
-        write_sealed(path, 2, schema=SCHEMA, of={})
+        write_sealed(path, b"2", schema=SCHEMA, of={})
     monkeypatch.undo()
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["state"]
     # what JSON cannot hold is refused before anything is written
     with pytest.raises(InputError, match="finite"):
-        write_sealed(path, float("nan"), schema=SCHEMA, of={})
+        write_sealed(path, b"2", schema=SCHEMA, of={"T_L": float("nan")})
     assert path.read_bytes() == before
 
 

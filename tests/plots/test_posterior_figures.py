@@ -21,7 +21,7 @@ from avtorch.validation.windows import synthetic_windows
 
 pytest.importorskip("arviz")
 WINDOWS = 6
-FILES = {"marginals.png", "joint.png", "ranks.png", "ecdf.png", "agreement.png"}
+FILES = {"marginals.png", "joint.png", "ecdf.png", "agreement.png"}
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,6 @@ def test_windows_shown_go_from_wide_to_narrow(validation: Validation) -> None:
     assert validation.quadrature is not None
     width = (validation.quadrature.sd / validation.quadrature.mean)[shown, 0]
     assert width.tolist() == sorted(width.tolist(), reverse=True)
-    assert all(t[1].startswith("SGLD inside") for t in titles)
 
 
 def test_exact_probabilities_are_uniform_and_show_a_shift(validation: Validation) -> None:
@@ -101,8 +100,6 @@ def test_exact_probabilities_are_uniform_and_show_a_shift(validation: Validation
     assert min(p_values[0]) > 1e-3
     assert p_values[1][0] == p_values[0][0]
     assert p_values[1][1] < 1e-9
-    names = ["SGLD 1", "SGLD 2", "SGLD 3", "SGLD 4", "NUTS", "exact"]
-    assert list(ChosenWindows(validation).groups(0, 0)) == names
 
 
 @pytest.mark.slow

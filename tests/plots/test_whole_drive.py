@@ -72,9 +72,8 @@ def test_logs_lie_one_behind_the_other_and_what_did_not_count_is_told() -> None:
     ],
 )
 def test_a_panel_a_channel(channels: tuple[str, ...], labels: list[str]) -> None:
-    for narrow in (False, True):
-        figure = drive_figure(found(channels), narrow=narrow)
-        assert [ax.get_ylabel() for ax in figure.axes] == labels
+    figure = drive_figure(found(channels))
+    assert [ax.get_ylabel() for ax in figure.axes] == labels
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     grounds = {"driver", "settling", "standstill"}
     assert set(names) == grounds | {"next log", "command", "measured", "baseline simulator", "with what was named"}

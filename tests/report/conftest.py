@@ -12,7 +12,7 @@ import avtorch
 from avtorch.experiment import Experiment, Information, library
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.remedy import setting_for
-from avtorch.report import report_html
+from avtorch.report.diagnosis import report_html
 from benchmarks.blindtest import draw_case
 from tests.report.in_chromium import PROGRAM
 

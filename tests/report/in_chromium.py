@@ -14,7 +14,7 @@ PROGRAMS = ("chromium-headless-shell", "chromium", "google-chrome")
 PROGRAM = next((path for path in map(shutil.which, PROGRAMS) if path), None)
 
 CUT_OFF = """() => [...document.querySelectorAll("body *")]
-  .filter(e => !e.closest("svg") && !e.closest("thead") && !e.closest("caption"))
+  .filter(e => !e.closest("svg, .drawn") && !e.closest("thead") && !e.closest("caption"))
   .filter(e => e.getBoundingClientRect().right > innerWidth + 0.5 || e.scrollWidth > e.clientWidth + 1 && e.clientWidth)
   .map(e => e.tagName + " " + e.textContent.slice(0, 60))"""
 LETTERS_PX = """() => [...document.querySelectorAll("svg text")].filter(e => e.getClientRects().length)

@@ -15,8 +15,11 @@ from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import Change, ChangeCause, ChangePart, Comparison
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.inference import SamplerSettings
-from avtorch.report import Origin, comparison_html, estimates_html, run_html, validation_html
-from avtorch.report.run import Regions
+from avtorch.report import Origin
+from avtorch.report.comparison import comparison_html
+from avtorch.report.estimates import estimates_html
+from avtorch.report.run import run_html
+from avtorch.report.validation import validation_html
 from avtorch.results import estimates_answer
 from avtorch.validation import NutsSettings, synthetic_windows, validate
 from tests.report.conftest import HOSTILE
@@ -72,7 +75,7 @@ def run() -> str:
         {"speed": lines, "accel": lines},
         truth=truth,
         bounds={"T_L": (0.1, 0.4), "K_L": (0.7, 1.0)},
-        regions=Regions(named, clouds),
+        regions=(named, clouds),
         origin=ORIGIN,
     )
 

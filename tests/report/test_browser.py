@@ -30,18 +30,15 @@ def test_every_table_is_reached_by_keyboard(browser: Any, path: Path) -> None:
     page = browser.new_page(viewport={"width": 1280, "height": 800})
     page.goto(path.as_uri())
     before = page.evaluate("() => [...document.querySelectorAll('details')].map(e => e.open)")
-    reached = []
-    for _ in before:
+    for _ in range(len(before) + page.locator(".drawn").count()):  # a wide picture is moved by keyboard, too
         page.keyboard.press("Tab")
-        reached.append(page.evaluate("() => document.activeElement.tagName"))
-        if reached[-1] == "SUMMARY":
+        if page.evaluate("() => document.activeElement.tagName") == "SUMMARY":
             page.keyboard.press("Enter")
-    assert reached.count("SUMMARY") == len(before)
     assert page.evaluate("() => [...document.querySelectorAll('details')].map(e => !e.open)") == before
     page.close()
 
 
-def test_paper_is_light_and_shows_the_wide_pictures(browser: Any, path: Path) -> None:
+def test_paper_is_light_and_shows_all_pictures_whole(browser: Any, path: Path) -> None:
     page = browser.new_page(viewport={"width": 700, "height": 990}, color_scheme="dark")
     page.goto(path.as_uri())
     page.emulate_media(media="print", color_scheme="dark")

@@ -14,7 +14,8 @@ import avtorch
 from avtorch.cli.app import main
 from avtorch.cli.arguments import COMMAND_LINE
 from avtorch.gap.result.diagnosis import Diagnosis
-from avtorch.report import Origin, report_html
+from avtorch.report import Origin
+from avtorch.report.diagnosis import report_html
 from tests.report.tree import read
 
 

@@ -10,7 +10,8 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.gap.result.diagnosis import Diagnosis
-from avtorch.report import report_html, write_report
+from avtorch.report import write_report
+from avtorch.report.diagnosis import report_html
 from tests.report.conftest import HOSTILE
 from tests.report.tree import read
 

@@ -10,7 +10,7 @@ import pytest
 from tests.report.pages import PAGES
 from tests.report.tree import Element, read
 
-PICTURES = {"diagnosis": 17, "estimates": 2, "run": 3, "comparison": 1, "simulators": 1, "validation": 5}
+PICTURES = {"diagnosis": 15, "estimates": 2, "run": 3, "comparison": 1, "simulators": 1, "validation": 4}
 """Of each page, by its name."""
 SLOW = {"validation"}
 """Its draws take seconds."""
@@ -38,22 +38,17 @@ def page(text: str) -> Element:
 def test_every_picture_has_words_and_a_table(name: str, page: Element) -> None:
     figures = list(page.all("figure"))
     assert len(figures) == PICTURES[name]
-    pictures = 0
     for figure in figures:
-        drawings = list(figure.all("svg"))
-        assert len(drawings) in (1, 2), "one for a desk and one for a phone, or one for both"
-        pictures += len(drawings)
-        for svg in drawings:
-            assert svg.attributes["role"] == "img"
-            assert len(svg.attributes["aria-label"]) > 40
-        assert len({svg.attributes["aria-label"] for svg in drawings}) == 1
+        (svg,) = figure.all("svg")
+        assert svg.attributes["role"] == "img"
+        assert len(svg.attributes["aria-label"]) > 40
         for details in figure.all("details"):
             assert details.inside[0].tag == "summary"
             assert details.inside[0].text()
         assert any(
             len(list(table.all("tr"))) > 1 for details in figure.all("details") for table in details.all("table")
         )
-    assert len(list(page.all("svg"))) == pictures, "no picture outside a figure"
+    assert len(list(page.all("svg"))) == len(figures), "no picture outside a figure"
     assert not list(page.all("img"))
 
 

@@ -2,161 +2,110 @@
 
 Damage has been seen to end the process (segmentation faults, 400 GB claimed by two cells), to fill its memory (pieces
 that inflate without end) and to hold it for ever (a chain of blocks that returns to itself). What ends there is one
-InputError here. The process lives as long as its recording, so a second reading starts at once.
+InputError here. A process answers one request and ends: what a file has, and what of it was asked for.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
-import threading
-import weakref
-from collections.abc import Callable, Collection, Sequence
-from contextlib import suppress
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.io.formats.kinds import PARQUET, Kind
 from avtorch.io.formats.listed import Channel, Recording
 from avtorch.io.opening import place
 
+Wanted = Collection[str] | re.Pattern[str] | None
+"""Channels or columns to read, by their names or by what these match; None: all."""
+
 MOST_SECONDS, SECONDS_PER_MIB = 60.0, 1.0
-"""For opening, and for each reading, by the size of the file: a workbook of 20 million cells takes a third of that."""
+"""For each request, by the size of the file: a workbook of 20 million cells takes a third of that."""
 
 
-def open_apart(path: str | os.PathLike[str], kind: Kind) -> Recording:
-    """Open a recording in a process of its own. Raises InputError, also where that process ends or takes too long."""
-    child = Child(path, kind)
+def open_apart(path: str | os.PathLike[str], kind: Kind, names: Collection[str] = ()) -> Recording:
+    """Open a recording by a process of its own; what it has of `names` comes along, other channels by another process.
 
-    def load(names: tuple[str, ...]) -> dict[str, Channel]:
-        answer = child.ask(names)
-        clocks = [child.numbers(count) for count in answer["clocks"]]
-        return {name: Channel(name, clocks[k], child.numbers(len(clocks[k]))) for name, k in answer["channels"]}
+    Raises InputError, also where a process ends or takes too long.
+    """
+    listing, first = _asked(path, kind, names)
+    there = _channels(listing, first)
 
-    listing = child.listing
-    found = Recording(child.source, listing["form"], listing["names"], listing["units"], listing["remarks"], load)
-    weakref.finalize(found, child.end)
-    return found
+    def load(wanted: tuple[str, ...]) -> dict[str, Channel]:
+        return there if there.keys() >= set(wanted) else _channels(*_asked(path, kind, wanted))
+
+    return Recording(place(path), listing["form"], listing["names"], listing["units"], listing["remarks"], load)
 
 
-def parquet_apart(
-    path: str | os.PathLike[str], wanted: Callable[[tuple[str, ...]], Collection[str]] | None
-) -> tuple[tuple[str, ...], Any]:
-    """The names of all columns of a Parquet file, and the `wanted` ones (default: all) as an Arrow table.
+def parquet_apart(path: str | os.PathLike[str], wanted: Wanted) -> tuple[tuple[str, ...], Any]:
+    """The names of all columns of a Parquet file, and the `wanted` ones as an Arrow table.
 
     Raises InputError, also where the process that reads it ends or takes too long.
     """
     import pyarrow as pa
 
-    child = Child(path, PARQUET)
+    listing, stream = _asked(path, PARQUET, wanted)
+    return tuple(listing["names"]), pa.ipc.open_stream(stream).read_all()
+
+
+def _channels(listing: dict[str, Any], numbers: memoryview) -> dict[str, Channel]:
+    """The channels that an answer brings: behind it stand the clocks, then the values of each."""
+    rows = listing["clocks"]
+    sizes = [*rows, *(rows[k] for _, k in listing["channels"])]
+    arrays = np.split(np.frombuffer(numbers).copy(), np.cumsum(sizes)[:-1])
+    values = arrays[len(rows) :]
+    return {name: Channel(name, arrays[k], x) for (name, k), x in zip(listing["channels"], values, strict=False)}
+
+
+def _asked(path: str | os.PathLike[str], kind: Kind, wanted: Wanted) -> tuple[dict[str, Any], memoryview]:
+    """What a process says of a file, a line of JSON, and the bytes of what is `wanted` behind it."""
+    asked = wanted.pattern if isinstance(wanted, re.Pattern) else None if wanted is None else list(wanted)
+    source, seconds = place(path), MOST_SECONDS + SECONDS_PER_MIB * _size(path) / 2**20
+    # -P: nothing of the folder that the user happens to work in
+    command = [sys.executable or "python", "-P", "-W", "ignore", "-m", "avtorch.io.formats.apart_process"]
+    # a trace of a panic, which nobody sees, takes most of a second
+    environment = dict(os.environ, RUST_BACKTRACE="0")
+    environment["PYTHONPATH"] = os.pathsep.join(part for part in sys.path if part)
     try:
-        names = tuple(child.listing["names"])
-        answer = child.ask(tuple(names if wanted is None else wanted(names)))
-        return names, pa.ipc.open_stream(child.content(answer["bytes"])).read_all()
-    finally:
-        child.end()
-
-
-class Child:
-    """The other process: requests are lines of JSON, answers are a line of JSON and the numbers it tells of. `listing`
-    is its first answer."""
-
-    def __init__(self, path: str | os.PathLike[str], kind: Kind) -> None:
-        self.source, self._words = place(path), kind.words
-        self._seconds = MOST_SECONDS + SECONDS_PER_MIB * _size(path) / 2**20
-        self._late = False
-        # -P: nothing of the folder that the user happens to work in
-        command = [sys.executable or "python", "-P", "-W", "ignore", "-m", "avtorch.io.formats.apart_process"]
-        # a trace of a panic, which nobody sees, takes most of a second
-        environment = dict(os.environ, RUST_BACKTRACE="0")
-        environment["PYTHONPATH"] = os.pathsep.join(part for part in sys.path if part)
-        try:
-            self._process = subprocess.Popen(
-                [*command, kind.words, os.fspath(path)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                env=environment,
-            )
-        except (OSError, ValueError) as fault:
-            raise InputError(f"{self.source}: no process can be started to read it ({fault})") from None
-        try:
-            self.listing = self._answer()
-        except BaseException:
-            self.end()
-            raise
-
-    def ask(self, names: Sequence[str]) -> dict[str, Any]:
-        """The answer to a request for channels or columns."""
-        assert self._process.stdin is not None
-        with suppress(OSError):  # where it has ended, the answer tells how
-            self._process.stdin.write(json.dumps(names).encode() + b"\n")
-            self._process.stdin.flush()
-        return self._answer()
-
-    def content(self, size: int) -> bytes:
-        """So many bytes behind an answer."""
-        raw = self._within(lambda stream: stream.read(size))
-        if len(raw) != size:
-            raise self._ended()
-        return raw
-
-    def numbers(self, count: int) -> FloatArray:
-        """So many numbers behind an answer."""
-        return np.frombuffer(self.content(8 * count), dtype=np.float64).copy()
-
-    def end(self) -> None:
-        """End the process, and leave nothing of it."""
-        self._process.kill()
-        self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout):
-            if stream is not None:
-                with suppress(OSError):  # a request that nobody will read
-                    stream.close()
-
-    def _answer(self) -> dict[str, Any]:
-        try:
-            answer = json.loads(self._within(lambda stream: stream.readline()))
-        except ValueError:
-            raise self._ended() from None
-        if "error" in answer:
-            raise InputError(answer["error"])
-        return answer
-
-    def _within(self, read: Any) -> bytes:
-        """What `read` takes of the answer; the process is ended when it is late."""
-
-        def end() -> None:
-            self._late = True
-            self._process.kill()
-
-        timer = threading.Timer(self._seconds, end)
-        timer.daemon = True
-        timer.start()
-        try:
-            return read(self._process.stdout)
-        finally:
-            timer.cancel()
-
-    def _ended(self) -> InputError:
-        if self._late:
-            return InputError(
-                f"{self.source}: is not read within {self._seconds:.3g} s; a smaller or an undamaged file is needed"
-            )
-        self._process.kill()
-        code = self._process.wait()
-        how = signal.Signals(-code).name if -code in signal.valid_signals() else f"status {code}"
-        return InputError(
-            f"{self.source}: is damaged, or takes more memory than it may: it ended the process that read it ({how}); "
-            f"an undamaged {self._words} file is needed"
+        done = subprocess.run(
+            [*command, kind.words, os.fspath(path)],
+            input=json.dumps(asked).encode(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment,
+            timeout=seconds,
+            check=False,
         )
+    except subprocess.TimeoutExpired:
+        raise InputError(
+            f"{source}: is not read within {seconds:.3g} s; a smaller or an undamaged file is needed"
+        ) from None
+    except (OSError, ValueError) as fault:
+        raise InputError(f"{source}: no process can be started to read it ({fault})") from None
+    line = done.stdout[: done.stdout.find(b"\n") + 1]
+    content = memoryview(done.stdout)[len(line) :]
+    try:
+        answer = json.loads(line)
+    except ValueError:
+        answer = {}
+    if "error" in answer:
+        raise InputError(answer["error"])
+    if len(content) != answer.get("bytes"):
+        code = -done.returncode
+        how = signal.Signals(code).name if code in signal.valid_signals() else f"status {done.returncode}"
+        raise InputError(
+            f"{source}: is damaged, or takes more memory than it may: it ended the process that read it ({how}); "
+            f"an undamaged {kind.words} file is needed"
+        )
+    return answer, content
 
 
 def _size(path: str | os.PathLike[str]) -> int:

@@ -7,7 +7,6 @@ A library is loaded when a file asks for it; its errors become one line.
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import os
 import re
 from collections.abc import Callable, Iterator
@@ -21,15 +20,6 @@ from avtorch.io.opening import beginning, place
 
 
 @dataclass(frozen=True)
-class Library:
-    """What reads a format: the module, the name under which it is installed, and the extra that brings it."""
-
-    module: str
-    package: str
-    extra: str
-
-
-@dataclass(frozen=True)
 class Kind:
     """One format."""
 
@@ -37,35 +27,28 @@ class Kind:
     """As messages call it."""
     reader: str
     """The module of this package that opens it."""
-    library: Library | None
-    """None where avtorch's own requirements read it."""
+    extra: str | None
+    """What brings its library; None where avtorch's own requirements read it."""
     suffixes: tuple[str, ...]
     """In lower case. A file of this name that does not begin as the format does is refused, not guessed at."""
     begins: str
     """How a file of this format begins, in words."""
 
 
-_ASAMMDF = Library("asammdf", "asammdf", "mdf")
-_ROSBAGS = Library("rosbags", "rosbags", "bags")
-_CAN = Library("can", "python-can", "can")
-_H5PY = Library("h5py", "h5py", "mat")
-_CALAMINE = Library("python_calamine", "python-calamine", "excel")
-_CYBER = Library("cyber_record", "cyber-record", "apollo")
-
-MDF = Kind("MDF", "mdf", _ASAMMDF, (".mf4", ".mdf", ".mf3"), "'MDF' or 'UnFinMF'")
-ROS1 = Kind("ROS 1 bag", "bags", _ROSBAGS, (".bag",), "'#ROSBAG V2.0'")
-ROS2_SQLITE = Kind("ROS 2 bag (SQLite)", "bags", _ROSBAGS, (".db3",), "'SQLite format 3'")
-ROS2_MCAP = Kind("ROS 2 bag (MCAP)", "bags", _ROSBAGS, (".mcap",), "the byte 0x89 and 'MCAP0'")
-ROS2_FOLDER = Kind("ROS 2 bag (folder)", "bags", _ROSBAGS, (), "a folder with metadata.yaml")
-BLF = Kind("CAN log (BLF)", "can", _CAN, (".blf",), "'LOGG'")
-ASC = Kind("CAN log (ASC)", "can", _CAN, (".asc",), "a line 'date ...' and a line 'base hex' or 'base dec'")
-CANDUMP = Kind("CAN log (candump)", "can", _CAN, (), "a line such as '(1700000000.000000) can0 123#0011'")
+MDF = Kind("MDF", "mdf", "mdf", (".mf4", ".mdf", ".mf3"), "'MDF' or 'UnFinMF'")
+ROS1 = Kind("ROS 1 bag", "bags", "bags", (".bag",), "'#ROSBAG V2.0'")
+ROS2_SQLITE = Kind("ROS 2 bag (SQLite)", "bags", "bags", (".db3",), "'SQLite format 3'")
+ROS2_MCAP = Kind("ROS 2 bag (MCAP)", "bags", "bags", (".mcap",), "the byte 0x89 and 'MCAP0'")
+ROS2_FOLDER = Kind("ROS 2 bag (folder)", "bags", "bags", (), "a folder with metadata.yaml")
+BLF = Kind("CAN log (BLF)", "can", "can", (".blf",), "'LOGG'")
+ASC = Kind("CAN log (ASC)", "can", "can", (".asc",), "a line 'date ...' and a line 'base hex' or 'base dec'")
+CANDUMP = Kind("CAN log (candump)", "can", "can", (), "a line such as '(1700000000.000000) can0 123#0011'")
 MAT5 = Kind("MAT", "matlab", None, (".mat",), "'MATLAB 5.0 MAT-file' or 'MATLAB 7.3 MAT-file'")
-MAT73 = Kind("MAT 7.3", "matlab", _H5PY, (), "'MATLAB 7.3 MAT-file'")
-EXCEL = Kind("Excel", "excel", _CALAMINE, (".xlsx", ".xlsm", ".xlsb"), "'PK', as a ZIP file")
-XLS = Kind("Excel 97", "excel", _CALAMINE, (".xls",), "the bytes D0 CF 11 E0")
-ODS = Kind("OpenDocument", "excel", _CALAMINE, (".ods",), "'PK', as a ZIP file")
-APOLLO = Kind("Apollo record", "apollo", _CYBER, (".record",), "a section of type 0 with its header")
+MAT73 = Kind("MAT 7.3", "matlab", "mat", (), "'MATLAB 7.3 MAT-file'")
+EXCEL = Kind("Excel", "excel", "excel", (".xlsx", ".xlsm", ".xlsb"), "'PK', as a ZIP file")
+XLS = Kind("Excel 97", "excel", "excel", (".xls",), "the bytes D0 CF 11 E0")
+ODS = Kind("OpenDocument", "excel", "excel", (".ods",), "'PK', as a ZIP file")
+APOLLO = Kind("Apollo record", "apollo", "apollo", (".record",), "a section of type 0 with its header")
 
 PARQUET = Kind("Parquet", "parquet", None, (".parquet", ".pq"), "'PAR1'")
 
@@ -104,7 +87,7 @@ def kind_at(path: str | os.PathLike[str]) -> Kind | None:
     Raises InputError where there is no regular file, and where the name promises a format that the content is not.
     """
     file = Path(path)
-    if _is_folder(file):
+    if os.path.isdir(path):
         return ROS2_FOLDER if (file / "metadata.yaml").is_file() else None
     head = beginning(path, _AHEAD, need=NEED)
     found = _by_content(head, file.suffix.lower())
@@ -122,21 +105,10 @@ def is_recording(path: str | os.PathLike[str]) -> bool:
 
     False for CSV, Parquet, and where there is no such file. Reads at most 4096 bytes and loads no library.
     """
-    file = Path(path)
     try:
         return kind_at(path) is not None
     except InputError:
-        try:
-            return _by_suffix(file) is not None and file.is_file()
-        except OSError:  # a name that no file can have
-            return False
-
-
-def _is_folder(file: Path) -> bool:
-    try:
-        return file.is_dir()
-    except (OSError, ValueError):  # a name that no file can have; opening it says so
-        return False
+        return _by_suffix(Path(path)) is not None and os.path.isfile(path)
 
 
 def _by_suffix(file: Path) -> Kind | None:
@@ -181,27 +153,14 @@ def _office(head: bytes, suffix: str) -> Kind | None:
 _REASON = 160  # characters of a library's message
 
 
-def refuse_missing(source: str, kind: Kind) -> None:
-    """Raises InputError saying what to install where the library of `kind` is not there; nothing is loaded."""
-    if kind.library is not None and importlib.util.find_spec(kind.library.module) is None:
-        raise InputError(
-            f"{source}: is {kind.words}; reading it needs {kind.library.package}: "
-            f"pip install 'avtorch[{kind.library.extra}]'"
-        )
-
-
 def library(module: str, source: str, kind: Kind) -> ModuleType:
-    """A module of the library of `kind`, or of one that comes with the same extra.
-
-    Raises InputError for one that is not there or cannot be loaded, such as one that lacks a part of its own.
-    """
+    """A module of the library of `kind`. Raises InputError for one that is not there or cannot be loaded."""
     try:
         return importlib.import_module(module)
     except Exception as fault:
-        extra = kind.library.extra if kind.library is not None else ""
         raise InputError(
-            f"{source}: is {kind.words}; reading it needs {module}, which cannot be loaded here ({reason(fault)}): "
-            f"pip install --force-reinstall 'avtorch[{extra}]'"
+            f"{source}: is {kind.words}; reading it needs {module}, which cannot be loaded ({reason(fault)}): "
+            f"pip install 'avtorch[{kind.extra}]'"
         ) from None
 
 

@@ -29,6 +29,7 @@ class Channel:
     values: FloatArray
 
 
+@dataclass(eq=False)
 class Recording:
     """An opened file: the file as messages name it (`source`), its `form` in words, such as ``MDF 4.10``, all numeric
     channels (`names`) in the file's order, their `units` as far as the file states them, and `remarks` on what was
@@ -37,24 +38,17 @@ class Recording:
     `load` reads channels that are asked for, each once, and at least one. Raises InputError for a file of no channel.
     """
 
-    def __init__(
-        self,
-        source: str,
-        form: str,
-        names: Collection[str],
-        units: Mapping[str, str],
-        remarks: Collection[str],
-        load: Callable[[tuple[str, ...]], dict[str, Channel]],
-    ) -> None:
-        self.source = source
-        self.form = form
-        self.names = tuple(names)
-        self.units: Mapping[str, str] = dict(units)
-        self.remarks = tuple(remarks)
-        self._load = load
-        self._known = frozenset(self.names)
+    source: str
+    form: str
+    names: Collection[str]
+    units: Mapping[str, str]
+    remarks: Collection[str]
+    load: Callable[[tuple[str, ...]], dict[str, Channel]]
+
+    def __post_init__(self) -> None:
+        self.names, self.remarks = tuple(self.names), tuple(self.remarks)
         if not self.names:
-            raise InputError(f"{source}: is {form} without any numeric channel; at least one is needed")
+            raise InputError(f"{self.source}: is {self.form} without any numeric channel; at least one is needed")
 
     def read(self, names: Collection[str]) -> dict[str, Channel]:
         """Channels by name, those that are asked for and no others.
@@ -65,11 +59,10 @@ class Recording:
         asked = tuple(dict.fromkeys(names))
         if len(asked) > MOST_COLUMNS:
             raise InputError(f"{self.source}: {len(asked):,} channels are asked for; {MOST_COLUMNS:,} at most can be")
-        for name in asked:
-            if name not in self._known:
-                there = listed(self.names)
-                raise InputError(f"{self.source}: channel {quoted(name, 80)} is missing; channels: {there}")
-        found = self._load(asked) if asked else {}
+        if missing := set(asked).difference(self.names):
+            name, there = quoted(min(missing, key=asked.index), 80), listed(self.names)
+            raise InputError(f"{self.source}: channel {name} is missing; channels: {there}")
+        found = self.load(asked) if asked else {}
         refuse_cells(self.source, sum(len(channel.values) for channel in found.values()))
         return {name: found[name] for name in asked}
 

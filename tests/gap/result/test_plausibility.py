@@ -16,7 +16,7 @@ from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.hypotheses import implausible
 from avtorch.gap.simulator.plant import BASELINE
-from avtorch.report import report_html
+from avtorch.report.diagnosis import report_html
 from tests.gap.records import Noise, log_of
 
 

@@ -121,8 +121,8 @@ def test_text_is_written_as_toml_or_not_at_all() -> None:
 def test_a_plant_is_a_regular_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
     for path, what in (
-        (tmp_path / "pipe.toml", "is a named pipe"),
-        (Path("/dev/zero"), "is a device"),
+        (tmp_path / "pipe.toml", "is no regular file"),
+        (Path("/dev/zero"), "is no regular file"),
         (tmp_path, "is a directory"),
         (Path("a\0.toml"), "no such file"),
         (Path(300 * "x" + ".toml"), "no such file"),
@@ -133,7 +133,7 @@ def test_a_plant_is_a_regular_file(tmp_path: Path) -> None:
         assert what in str(fault.value)
         assert str(fault.value).isprintable()
         assert "root:x" not in str(fault.value)
-    with pytest.raises(InputError, match="is a named pipe"):
+    with pytest.raises(InputError, match="is no regular file"):
         read_simulator("--baseline", str(tmp_path / "pipe.toml"))
 
 

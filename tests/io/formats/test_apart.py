@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import io
-import json
 import subprocess
 from pathlib import Path
 
@@ -12,7 +9,7 @@ import numpy as np
 import pytest
 
 from avtorch.errors import InputError
-from avtorch.io.formats import apart, apart_process, open_recording
+from avtorch.io.formats import apart, open_recording
 
 from .survival import open_here
 from .test_bags import mcap
@@ -28,15 +25,6 @@ WRITERS = {
     "73.mat": lambda path: mat73(path, STRUCTS),
     "xlsx": lambda path: xlsx(path, {"notes": [["by hand"]], "log": [*LOG, [900.0, None, 0.5, "dry"]]}),
 }
-
-
-@pytest.fixture
-def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen]:
-    """The processes that were started."""
-    all_: list[subprocess.Popen] = []
-    start = subprocess.Popen
-    monkeypatch.setattr(subprocess, "Popen", lambda *given, **named: all_.append(start(*given, **named)) or all_[-1])
-    return all_
 
 
 @pytest.mark.parametrize("form", WRITERS)
@@ -84,32 +72,10 @@ def test_two_cells_that_claim_a_sheet_of_400_gb(tmp_path: Path) -> None:
         open_recording(path)
 
 
-@pytest.mark.slow
-def test_a_process_that_ends_between_two_readings(tmp_path: Path, started: list[subprocess.Popen]) -> None:
-    recording = open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
-    recording.read(["log.speed"])
-    started[-1].kill()
-    for _ in range(2):
-        with pytest.raises(InputError, match=r"drive.mat: is damaged, .* \(SIGKILL\); an undamaged MAT file is needed"):
-            recording.read(["log.speed"])
-
-
 def test_a_process_that_takes_too_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(apart, "MOST_SECONDS", 0.001)
     with pytest.raises(InputError, match=r"is not read within .* s; a smaller or an undamaged file is needed"):
         open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
-
-
-@pytest.mark.slow
-def test_the_process_ends_with_its_recording(tmp_path: Path, started: list[subprocess.Popen]) -> None:
-    recording = open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
-    process = started[-1]
-    assert process.poll() is None
-    del recording
-    gc.collect()
-    assert process.poll() is not None
-    assert process.stdout is not None
-    assert process.stdout.closed
 
 
 def test_no_process_can_be_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,14 +84,7 @@ def test_no_process_can_be_started(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
 
 
-def test_requests_are_answered_one_by_one(tmp_path: Path) -> None:
-    recording = open_here(mat5(tmp_path / "drive.mat", STRUCTS))
-    out = io.BytesIO()
-    requests = [["log.speed", "log.engaged"], ["none"], ["log.cmd"]]
-    apart_process.serve(recording, [json.dumps(names).encode() for names in requests], out)
-    out.seek(0)
-    assert json.loads(out.readline()) == {"clocks": [150], "channels": [["log.speed", 0], ["log.engaged", 0]]}
-    out.read(3 * 150 * 8)
-    assert "is missing" in json.loads(out.readline())["error"]
-    assert json.loads(out.readline())["clocks"] == [75]
-    assert len(out.read()) == 2 * 75 * 8
+def test_what_is_asked_for_comes_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = open_recording(mat5(tmp_path / "drive.mat", STRUCTS), ["log.speed", "log.engaged", "none"])
+    monkeypatch.setattr(subprocess, "run", None)
+    assert list(recording.read(["log.engaged", "log.speed"])) == ["log.engaged", "log.speed"]
