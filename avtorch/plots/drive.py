@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.ticker import NullLocator
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
@@ -31,10 +32,11 @@ from avtorch.plots.style import (
     VERMILLION,
     WIDE,
     legend,
+    panels_of,
     styled,
 )
 
-Against = Literal["command", "speed", "earlier commands"]
+Against = Literal["command", "speed", "frequency", "earlier commands"]
 
 _INTERVALS = 260  # of a line
 _SMALL = (4.0, 2.7)  # inches: as wide as a phone or half a desk's page
@@ -246,6 +248,23 @@ def _against(ax: Axes, found: Diagnosis, left: Residuals, axis: Literal["command
     ax.set(xlabel=f"{axis} [{'m/s²' if axis == 'command' else 'm/s'}]", ylabel="mean residual [m/s²]")
 
 
+def _spectrum(ax: Axes, found: Diagnosis, left: Residuals) -> None:
+    """Power of the residual over frequency, with its central 90 %."""
+    for label, residual in sides(found, left).items():
+        spectrum = left.spectrum(residual)
+        if spectrum is not None:
+            # an interval of frequencies a point: a picture has no room for hundreds
+            few = np.unique(np.geomspace(1, len(spectrum.frequency), 60).astype(int)) - 1
+            f, power, low, high = (x[few] for x in (spectrum.frequency, spectrum.power, spectrum.low, spectrum.high))
+            ax.fill_between(f, low, high, color=_COLOURS[label], alpha=0.2, lw=0)
+            ax.plot(f, power, color=_COLOURS[label], lw=1.2, label=label)
+    ax.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="power [(m/s²)²/Hz]")
+    ax.margins(x=0)
+    for along in (ax.xaxis, ax.yaxis):
+        along.set_minor_locator(NullLocator())
+        along.set_major_formatter("{x:g}")
+
+
 def _correlation(ax: Axes, found: Diagnosis, left: Residuals) -> None:
     """Correlation of the residual with commands before it, and the band of 99 % for one that depends on none."""
     band = 0.0
@@ -267,12 +286,36 @@ def residual_figure(found: Diagnosis, against: Against) -> Figure:
     """
     figure, left = Figure(figsize=_SMALL, layout="constrained"), residuals_of(found)
     ax = figure.add_subplot()
-    if against == "earlier commands":
+    if against == "frequency":
+        _spectrum(ax, found, left)
+    elif against == "earlier commands":
         _correlation(ax, found, left)
     else:
         _against(ax, found, left, against)
     legend(figure, [ax], columns=2, fontsize=8)
     return figure
+
+
+@styled
+def residual_time_figure(found: Diagnosis) -> Figure:
+    """The residual over the whole drive, and where 99 % of a steady one with the same quartiles would lie."""
+    traces, left, axis = traces_of(found), residuals_of(found), drive_time(found)
+    along = axis.along[np.searchsorted(_rising(traces.time, traces.stretch), _rising(left.time, left.stretch))]
+    figure, (ax,) = panels_of(1, 2.6)
+    usual = 0.0
+    for label, residual in sides(found, left).items():
+        line = envelope(along, residual, left.stretch, _INTERVALS)
+        ax.plot(*line, color=_COLOURS[label], lw=0.9, label=label)
+        usual = left.usual(residual)
+    ax.axhspan(-usual, usual, color=GREY, alpha=0.25, lw=0, zorder=0)
+    ax.set(xlabel=axis.label, ylabel="residual [m/s²]", xlim=(float(axis.along[0]), float(axis.along[-1])))
+    legend(figure, [ax])
+    return figure
+
+
+def _rising(time: FloatArray, stretch: FloatArray | np.ndarray) -> FloatArray:
+    """A key of rows that rises over all stretches, of which several logs may have the same times."""
+    return stretch * 1e7 + time
 
 
 # what to drive next ------------------------------------------------------------------------------------------------

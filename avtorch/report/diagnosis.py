@@ -387,7 +387,15 @@ def _residuals(found: Diagnosis) -> Section:
             "chance does, follows the command in a way that the simulator does not.",
         )
     )
-    return Section(title, _what_is_left(left, both), small=pictures)
+    if left.spectrum(last) is not None:
+        pictures.append(
+            picture_of(
+                "residual-frequency",
+                drive.residual_figure(found, "frequency"),
+                caption="Against frequency: power averaged over windows of 20 s; bands are 90 %.",
+            )
+        )
+    return Section(title, _what_is_left(left, both), (_residual_over_time(found, left, both),), tuple(pictures))
 
 
 def _what_is_left(left: Residuals, both: Mapping[str, FloatArray]) -> tuple[str, ...]:
@@ -420,6 +428,26 @@ def _apart(bins: BinnedMeans) -> bool:
     """Whether more bins than chance would exclude 0: of 90 % intervals, one in ten does."""
     known = np.isfinite(bins.low)
     return int(((bins.low > 0) | (bins.high < 0))[known].sum()) > max(2, 0.3 * int(known.sum()))
+
+
+def _residual_over_time(found: Diagnosis, left: Residuals, both: Mapping[str, FloatArray]) -> Picture:
+    columns = ("part of the drive [s]", *(f"{what} {label} [m/s²]" for label in both for what in ("mean", "SD")))
+    rows = [
+        (
+            f"{left.time[part[0]]:.0f} to {left.time[part[-1]]:.0f}",
+            *(f"{size:.3f}" for residual in both.values() for size in (residual[part].mean(), residual[part].std())),
+        )
+        for part in np.array_split(np.arange(len(left.time)), _PARTS)
+    ]
+    judged = list(both.values())[-1]
+    beyond = f"{100 * float(np.mean(np.abs(judged) > left.usual(judged))):.1f} %"
+    return picture_of(
+        "residual-time",
+        drive.residual_time_figure(found),
+        Table("Residual in parts of the drive", columns, tuple(rows), numeric=columns[1:]),
+        caption="Grey ground: where 99 % of a steady normal residual with the quartiles of the last line would lie; "
+        f"{beyond} lie beyond.",
+    )
 
 
 def _residual_against(

@@ -10,7 +10,7 @@ import pytest
 from tests.report.pages import PAGES
 from tests.report.tree import Element, read
 
-PICTURES = {"diagnosis": 15, "estimates": 2, "run": 3, "comparison": 1, "simulators": 1, "validation": 4}
+PICTURES = {"diagnosis": 17, "estimates": 2, "run": 3, "comparison": 1, "simulators": 1, "validation": 4}
 """Of each page, by its name."""
 SLOW = {"validation"}
 """Its draws take seconds."""

@@ -1,9 +1,9 @@
-"""What is left of the gap: residuals of the rollouts against command, speed and earlier commands.
+"""What is left of the gap: residuals of the rollouts against command, speed, time, frequency and earlier commands.
 
-Bands say how far chance alone would go: means of bins by the spread between blocks of the drive, the correlation with
-earlier commands by Bartlett's formula for two independent coloured signals (Box, Jenkins and Reinsel, Time Series
-Analysis, 4th ed., 2008, Sec. 12.1), as in the residual test of system identification (Ljung, System Identification, 2nd
-ed., 1999, Sec. 16.6).
+Bands say how far chance alone would go: means of bins by the spread between blocks of the drive, the spectrum by the
+chi-square law of its average, the correlation with earlier commands by Bartlett's formula for two independent coloured
+signals (Box, Jenkins and Reinsel, Time Series Analysis, 4th ed., 2008, Sec. 12.1), as in the residual test of system
+identification (Ljung, System Identification, 2nd ed., 1999, Sec. 16.6).
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import correlate
-from scipy.special import stdtrit
+from scipy.signal import correlate, welch
+from scipy.special import chdtri, stdtrit
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.result.traces import Traces
@@ -21,9 +21,11 @@ from avtorch.gap.result.traces import Traces
 BLOCK_S = 10.0
 """Length of the blocks whose spread gives a bin's interval [s]."""
 _SLOPE_S = 1.0  # over which a speed error is turned into an acceleration error
+_SEGMENT_S = 20.0  # of the averaged spectra
 _COLOUR_S = 30.0  # up to which signals are correlated with themselves
 _LEAST_BLOCKS = 4  # in a bin that has an interval
 _Z99 = 2.5758293035489004
+_OVERLAPPED = 1.89  # degrees of freedom per segment: Hann windows that overlap by half (Welch, 1967)
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,21 @@ class Residuals:
         half = np.where(blocks >= _LEAST_BLOCKS, stdtrit(np.maximum(blocks - 1, 1), 0.95) * spread, np.nan)
         return BinnedMeans(along.sum(0) / total, mean, mean - half, mean + half)
 
+    def spectrum(self, residual: FloatArray) -> Spectrum | None:
+        """Power of `residual` (row,) over frequency; None where no stretch is long enough."""
+        size = max(8, round(_SEGMENT_S / self.step))
+        count, total, frequency = 0, np.zeros(size // 2 + 1), np.zeros(0)
+        for rows in self._stretches():
+            if parts := (len(rows) - size) // (size // 2) + 1 if len(rows) >= size else 0:
+                frequency, power = welch(residual[rows], 1 / self.step, nperseg=size, noverlap=size - size // 2)
+                count, total = count + parts, total + parts * power
+        if not count:
+            return None
+        mean = total[1:] / count
+        freedom = max(2.0, _OVERLAPPED * count)
+        low, high = (freedom / chdtri(freedom, p) for p in (0.05, 0.95))
+        return Spectrum(frequency[1:], mean, mean * low, mean * high)
+
     def correlation(self, residual: FloatArray, *, seconds: float = 5.0) -> Correlation:
         """Of `residual` (row,) with the command a lag earlier, from -1 s (a later command) to `seconds`."""
         first, last = -round(1.0 / self.step), round(seconds / self.step)
@@ -94,6 +111,11 @@ class Residuals:
         return Correlation(
             np.linspace(first * self.step, last * self.step, last - first + 1), both, _Z99 * variance**0.5
         )
+
+    def usual(self, residual: FloatArray) -> float:
+        """Within ± this [m/s²] would lie 99 % of a steady normal `residual` (row,) with these quartiles."""
+        low, high = np.quantile(residual, (0.25, 0.75))
+        return float(_Z99 * (high - low) / (2 * 0.6744897501960817))
 
     def _stretches(self) -> list[IntArray]:
         return np.split(np.arange(len(self.time)), np.flatnonzero(np.diff(self.stretch)) + 1)
@@ -124,6 +146,15 @@ class BinnedMeans(NamedTuple):
 
     place: FloatArray
     mean: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+class Spectrum(NamedTuple):
+    """Power density [(m/s²)²/Hz] over `frequency` [Hz], each (frequency,), with its central 90 %."""
+
+    frequency: FloatArray
+    power: FloatArray
     low: FloatArray
     high: FloatArray
 

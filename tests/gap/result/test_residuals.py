@@ -88,6 +88,25 @@ def test_nothing_is_correlated_across_a_gap() -> None:
     assert np.abs(residuals(e, u, apart).correlation(e).value).max() < 0.02
 
 
+def test_white_noise_has_its_power_at_every_frequency() -> None:
+    e = 0.2 * np.random.default_rng(6).standard_normal(40_000)
+    spectrum = residuals(e).spectrum(e)
+    assert spectrum is not None
+    truth = 2 * 0.2**2 * STEP
+    # of 198 averaged windows, 200 frequencies: a few in a thousand of their mean
+    assert spectrum.power[:-1].mean() == pytest.approx(truth, rel=0.02)
+    covered = np.mean((spectrum.low <= truth) & (spectrum.high >= truth))
+    assert 0.9 - 4 * np.sqrt(0.09 / 200) <= covered <= 0.9 + 4 * np.sqrt(0.09 / 200)
+    assert residuals(e[:100]).spectrum(e[:100]) is None
+
+
+def test_usual_is_where_99_percent_of_normal_rows_lie() -> None:
+    e = 0.3 * np.random.default_rng(7).standard_normal(100_000)
+    spikes = np.where(np.arange(len(e)) % 50 == 0, 10.0, e)
+    assert np.mean(np.abs(e) > residuals(e).usual(e)) == pytest.approx(0.01, abs=0.002)
+    assert residuals(spikes).usual(spikes) == pytest.approx(residuals(e).usual(e), rel=0.05)
+
+
 def test_a_log_without_acceleration_has_the_slope_of_its_speed() -> None:
     rows = 1200
     time = clock(rows)
