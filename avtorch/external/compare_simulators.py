@@ -1,6 +1,6 @@
 """Which of two simulators is nearer to a car: both driven by the commands of its drives, scored by one measure.
 
-Both are scored on the same rows, by the errors of rollouts over 10 s as `avtorch.compare` has them. Nothing is fitted
+Both are scored on the same rows, by the errors of free runs of 10 s as `avtorch.compare` has them. Nothing is fitted
 to the car: the surrogates are fitted to the simulators' own output. So nothing has to be held out.
 
 Let `s_b` and `t_b` be the shares of block `b` in the squared errors S and T of the two. The logarithm of the ratio of
@@ -39,10 +39,9 @@ from avtorch.external.external_simulator import ExternalSimulator, Progress
 from avtorch.external.simulator import DrivenPlant
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.compare import LEVEL
-from avtorch.gap.drive_record import FEWEST_BLOCKS, Record, blocks_of
+from avtorch.gap.drive_record import FEWEST_BLOCKS, HORIZON_S, Record, blocks_of
 from avtorch.gap.quantity import Quantity, of_fields, unit_of, words_of
 from avtorch.gap.result.log_facts import LogFacts
-from avtorch.gap.rollout_errors import HORIZON_S, block_squares, reached, rolled_out
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log, LogSource, as_logs
@@ -229,16 +228,13 @@ class ScoredBlocks:
             raise InputError(
                 f"logs: found {len(blocks)} blocks of 4 s of usable driving, needs {FEWEST_BLOCKS} or more"
             )
-        return cls(record, blocks, reached(record, HORIZON_S))
+        longest = max(block.stop - block.start for block in blocks) * record.dt
+        return cls(record, blocks, min(HORIZON_S, longest))
 
-    def squares(self, errors: FloatArray, lag: float) -> dict[str, FloatArray]:
-        """Squared errors by metric (block,), of a long rollout's `errors` (channel, counted, group); `lag` [s] of its
-        actuator."""
+    def squares(self, errors: FloatArray) -> dict[str, FloatArray]:
+        """Squared errors by metric (block,), of a rollout's `errors` (channel, counted, group)."""
         least = _LEAST**2 * self._rows
-        return {
-            name: np.maximum(x, least)
-            for name, x in block_squares(self.record, errors, self.blocks, lag, self.horizon_s).items()
-        }
+        return {name: np.maximum(x, least) for name, x in self.record.squares(errors, self.blocks).items()}
 
     def log_ratio(self, one: Mapping[str, FloatArray], two: Mapping[str, FloatArray]) -> LogRatio:
         """Of the errors of `two` to those of `one`, squares (block,) by metric; the mean over the metrics."""
@@ -269,11 +265,11 @@ def differences(
     """
     chains = [surrogate.plant for surrogate in surrogates]
     base, donor = chains[far], chains[1 - far]
-    own = rolled_out(scored.record, base)
+    own = scored.record.rolled_out(base)
     sides = {name: [_values(surrogate, name) for surrogate in surrogates] for name in _parts(chains)}
     apart = [name for name, (one, two) in sides.items() if not _alike(one, two)]
     known: dict[frozenset[str], LogRatio] = {}
-    as_it_is = scored.squares(errors, float(base.T_L))
+    as_it_is = scored.squares(errors)
 
     def with_parts(names: frozenset[str]) -> LogRatio:
         """Of the error with these parts as in the other one to what it is."""
@@ -281,8 +277,8 @@ def differences(
             changed = base
             for name in sorted(names):
                 changed = _with_part(changed, donor, name)
-            moved = errors + own - rolled_out(scored.record, changed) if names else errors
-            known[names] = scored.log_ratio(as_it_is, scored.squares(moved, float(changed.T_L)))
+            moved = errors + own - scored.record.rolled_out(changed) if names else errors
+            known[names] = scored.log_ratio(as_it_is, scored.squares(moved))
         return known[names]
 
     alone = sorted(apart, key=lambda name: -abs(with_parts(frozenset((name,))).mean))
@@ -394,8 +390,7 @@ def compare_simulators(
     ]
     scored = ScoredBlocks.of(Record.of(cars))
     errors = [_errors(scored.record, outputs) for outputs, _ in rolled]
-    lags = [float(surrogate.plant.T_L) for surrogate in surrogates]
-    one, two = (scored.squares(e, lag) for e, lag in zip(errors, lags, strict=True))
+    one, two = (scored.squares(e) for e in errors)
     both = scored.log_ratio(one, two)
     far = 0 if both.mean < 0 else 1
     told = [

@@ -9,7 +9,7 @@ The cause: T_L alone, K_L alone, dead time, or an effect of the table, whichever
 model of both sides that shares all the rest (`engine.joint`). Where `T_L` or `K_L` differ, the same model tells a
 change of dead time, which resembles a longer lag, from one of lag and gain.
 
-The simulator: rollout errors over both sets, and their ratio over bootstrapped blocks.
+The simulator: errors of free runs over both sets, and their ratio over bootstrapped runs.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.gap.drive_record import FEWEST_BLOCKS, Record, blocks_of
+from avtorch.gap.drive_record import FEWEST_BLOCKS, HORIZON_S, Record, blocks_of, runs_over
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import jacobian, prior_terms, whitened_jacobian
 from avtorch.gap.engine.joint import JointModel, block_scores
@@ -36,7 +36,6 @@ from avtorch.gap.result.cause_of_change import cause_of_change, dead_time_test
 from avtorch.gap.result.comparison import Change, ChangeCause, Comparison, DeadTimeTest, SimulatorChange
 from avtorch.gap.result.diagnosis import BlackBoxSimulator
 from avtorch.gap.result.log_facts import LogFacts
-from avtorch.gap.rollout_errors import HORIZON_S, block_squares, reached, rolled_out
 from avtorch.gap.simulator.effect import Effect, chosen_effects
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log, LogSource, as_logs
@@ -50,7 +49,7 @@ _CAR = ("T_L", "K_L")
 _TURNS = 12  # of Gauss-Newton
 _DRAWS = 2000
 _HORIZONS = (HORIZON_S, 5.0, 2.0, 1.0)
-_WHOLE_SHARE = 0.4  # of a side's rows that have a whole rollout behind them
+_WHOLE_SHARE = 0.4  # of a side's rows that are in whole runs
 
 
 @shows_progress
@@ -131,8 +130,8 @@ def compare(
     simulators = [p if b is not None else one.fitted(plants[0]) for p, b in zip(plants, given, strict=True)]
     facts = [LogFacts.of(logs) for logs in sides]
     same = replace(facts[0], name="") == replace(facts[1], name="")
-    horizon = _horizon(fitted)
-    gap = _gaps(fitted, simulators, horizon, same=same)
+    horizon, runs = _whole_runs([side.record for side in fitted])
+    gap = _gaps(fitted, simulators, horizon, runs, same=same)
     simulator = _simulator_change(gap)
     changed = p_value < level
     cause, of_two = None, None
@@ -219,7 +218,7 @@ def _by_rows(record: Record, base: GapPlant, blocks: Sequence[slice]) -> tuple[F
     def errors(z: FloatArray) -> FloatArray:
         """(channel, row): of acceleration, and of the speed's rise between rows."""
         car = base.with_values(dict(zip(_CAR, np.exp(z).tolist(), strict=True)))
-        e = (record.measured - rolled_out(record, car)).mean(-1)
+        e = (record.measured - record.rolled_out(car)).mean(-1)
         for k, channel in enumerate(record.channels):
             if channel == "speed":
                 e[k] = np.diff(e[k], prepend=e[k, :1]) / record.dt
@@ -241,45 +240,39 @@ def _by_rows(record: Record, base: GapPlant, blocks: Sequence[slice]) -> tuple[F
     return z, information, np.stack([scores[:, b].sum(1) for b in blocks], 1)
 
 
-def _horizon(sides: Sequence[_LagAndGain]) -> float:
-    """Length of the rollouts [s], up to `HORIZON_S`, that fits the stretches of both sides: errors grow with it.
-
-    The longest of which both sides hold enough that is whole. A rollout that begins with its stretch is shorter, and of
-    many overrides most would be.
-    """
-    records = [side.record for side in sides]
+def _whole_runs(records: Sequence[Record]) -> tuple[float, list[list[slice]]]:
+    """Length of the free runs [s], up to `HORIZON_S`, and the runs of each side. Errors grow with the length: it is the
+    longest of which both sides hold enough that are whole."""
+    horizon, each = _HORIZONS[-1], []
     for horizon in _HORIZONS:
-        rows = [sum(block.stop - block.start for block in _whole(record, horizon)) for record in records]
-        if all(count > _WHOLE_SHARE * record.rows for count, record in zip(rows, records, strict=True)):
-            return horizon
-    return min(reached(r, _HORIZONS[-1]) for r in records)
-
-
-def _whole(record: Record, horizon: float) -> list[slice]:
-    """The blocks without the rows that have less than `horizon` [s] of their stretch before them."""
-    found: list[slice] = []
-    for block in blocks_of(record, fewest=FEWEST_BLOCKS):
-        stretch = int(record.starts[np.searchsorted(record.starts, block.start, side="right") - 1])
-        begin = max(block.start, stretch + round(horizon / record.dt))
-        found += [slice(begin, block.stop)] if begin < block.stop else []
-    return found if len(found) >= FEWEST_BLOCKS else []
+        rows = [round(horizon / record.dt) for record in records]
+        each = [
+            [run for run in runs_over(record.stretches, n) if run.stop - run.start == n]
+            for record, n in zip(records, rows, strict=True)
+        ]
+        whole = zip(each, rows, records, strict=True)
+        if all(len(runs) >= max(FEWEST_BLOCKS, _WHOLE_SHARE * record.rows / n) for runs, n, record in whole):
+            break
+    return horizon, each
 
 
 def _gaps(
-    sides: Sequence[_LagAndGain], simulators: Sequence[GapPlant], horizon: float, *, same: bool
+    sides: Sequence[_LagAndGain],
+    simulators: Sequence[GapPlant],
+    horizon: float,
+    runs: Sequence[Sequence[slice]],
+    *,
+    same: bool,
 ) -> dict[str, Change]:
-    """Rollout errors before and after, by metric; both sides use the same bootstrap draws for the `same` drives."""
+    """Errors of free runs before and after, by metric; the `same` drives have the same bootstrap draws."""
     drawn: list[dict[str, FloatArray]] = []
-    for i, (side, simulator) in enumerate(zip(sides, simulators, strict=True)):
-        rng = np.random.default_rng(0 if same else i)
-        record = side.record
-        errors = record.measured - rolled_out(record, simulator)
-        blocks = _whole(record, horizon) or blocks_of(record, fewest=FEWEST_BLOCKS)
-        squares = block_squares(record, errors, blocks, float(simulator.T_L), horizon)
-        rows = np.array([(b.stop - b.start) * record.group for b in blocks], float)
-        weights = rng.multinomial(len(blocks), np.full(len(blocks), 1 / len(blocks)), size=_DRAWS)
-        weights = np.concatenate([np.ones((1, len(blocks))), weights])
-        drawn.append({name: np.sqrt(weights @ x / (weights @ rows)) for name, x in squares.items()})
+    for i, (side, simulator, own) in enumerate(zip(sides, simulators, runs, strict=True)):
+        record, count = side.record, len(own)
+        squares = record.squares(record.measured - record.rolled_out(simulator), own, horizon)
+        weights = np.random.default_rng(0 if same else i).multinomial(count, np.full(count, 1 / count), size=_DRAWS)
+        weights = np.concatenate([np.ones((1, count)), weights])
+        rows = (own[0].stop - own[0].start) * record.group
+        drawn.append({name: np.sqrt(weights @ x / (count * rows)) for name, x in squares.items()})
     return {
         name: Change(*(Quantity.of_resampled(x[0], x[1:]) for x in (before, drawn[1][name], drawn[1][name] / before)))
         for name, before in drawn[0].items()

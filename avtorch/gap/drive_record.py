@@ -6,6 +6,9 @@ measurement. Of the override rows only the measured speed is used, to integrate 
 
 Rows above about 20 Hz are grouped; rollouts have every row. Rows at standstill do not count, but rollouts continue
 through them, as if the actuator still followed the command and the ground held the car.
+
+A simulated speed is compared in free runs, each begun at what was measured: over a whole drive the speed of any model
+drifts away. An acceleration needs no beginning, as the lag forgets it.
 """
 
 from __future__ import annotations
@@ -23,12 +26,17 @@ from torch import Tensor
 
 from avtorch.arrays import Float, FloatArray, Int, IntArray
 from avtorch.errors import InputError
+from avtorch.gap.simulator.plant import GapPlant
 from avtorch.gap.simulator.simulator_input import SimulatorInput
 from avtorch.io import Log
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import no_command
 
+HORIZON_S = 10.0
+"""Of the free runs by whose errors simulators are judged [s]."""
+BEGIN_S = 0.5
+"""Over which the measured speed at the begin of a free run is averaged [s]."""
 RATE_HZ = 20.0
 """Rows are averaged as long as the resulting rate is at least this [Hz]."""
 _SHORTEST_S = 2.0
@@ -75,6 +83,33 @@ class MeasuredRows:
     def starts(self) -> Int[IntArray, " stretch"]:
         """Index of each stretch's first counted row."""
         return np.flatnonzero(np.diff(self.stretch, prepend=-1))
+
+    @property
+    def stretches(self) -> list[slice]:
+        """Counted rows of each stretch."""
+        return [slice(a, b) for a, b in pairwise([*self.starts.tolist(), self.rows])]
+
+    @property
+    def longest_s(self) -> float:
+        """Length of the longest free runs [s]: `HORIZON_S`, or that of the longest stretch."""
+        return min(HORIZON_S, max(part.stop - part.start for part in self.stretches) * self.dt)
+
+    def squares(self, errors: FloatArray, parts: Sequence[slice], horizon: float = HORIZON_S) -> dict[str, FloatArray]:
+        """Sums of squared errors (part,), by metric, of a rollout's `errors` (channel, counted, group) in free runs of
+        at most `horizon` [s] over each of `parts` of counted rows."""
+        group, out = self.group, {}
+        own = [slice(part.start * group, part.stop * group) for part in parts]
+        for name, x in zip(self.channels, errors.reshape(len(self.channels), -1), strict=True):
+            runs = runs_over(own, round(horizon / self.dt) * group)
+            away = free_runs(x, runs, self.dt / group) if name == "speed" else x
+            out[f"rollout_rmse_{name}"] = np.array([away[part] @ away[part] for part in own])
+        return out
+
+    def rms(self, errors: FloatArray) -> dict[str, float]:
+        """Root mean squares by channel of a rollout's `errors` (channel, counted, group) in free runs over all rows."""
+        squares = self.squares(errors, self.stretches).values()
+        rows = self.rows * self.group
+        return {name: float(np.sqrt(x.sum() / rows)) for name, x in zip(self.channels, squares, strict=True)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +170,25 @@ class Record(MeasuredRows):
         """Responses by drive, (..., time) each, at counted rows: (..., counted, group)."""
         whole = torch.cat([x.unflatten(-1, (-1, self.group)) for x in responses], -2)
         return whole.numpy()[..., self.source, :]
+
+    def rolled_out(self, simulator: GapPlant) -> Float[FloatArray, "channel counted group"]:
+        """What a simulator makes of the whole drives."""
+        responses = [simulator.response(drive) for drive in self.drives]
+        channels = {"accel": [r.accel_measured for r in responses], "speed": [r.speed_measured for r in responses]}
+        return np.stack([self.at_counted_rows(channels[name]) for name in self.channels])
+
+
+def runs_over(parts: Iterable[slice], rows: int) -> list[slice]:
+    """Each part cut into runs of `rows` rows, the last one of what is left."""
+    return [slice(i, min(i + rows, part.stop)) for part in parts for i in range(part.start, part.stop, rows)]
+
+
+def free_runs(errors: FloatArray, runs: Iterable[slice], dt: float) -> FloatArray:
+    """Errors (..., row) of a speed, rows `dt` [s] apart, in runs that begin at the mean measured over `BEGIN_S`."""
+    out, begin = errors.copy(), max(1, round(BEGIN_S / dt))
+    for run in runs:
+        out[..., run] -= errors[..., run][..., :begin].mean(-1, keepdims=True)
+    return out
 
 
 def same_kind(logs: Sequence[Log]) -> None:
@@ -236,7 +290,7 @@ def blocks_of(record: Record, *, fewest: int = 0) -> list[slice]:
 
 def _blocks(record: Record, whole_s: float) -> Iterator[slice]:
     seconds = whole_s * float(np.clip(round(record.rows * record.dt / _BLOCKS / whole_s), 1, 6))
-    for begin, end in pairwise([*record.starts.tolist(), record.rows]):
-        count = max(1, int((end - begin) * record.dt / seconds + 1e-9))
-        edges = np.linspace(begin, end, count + 1).round().astype(int).tolist()
+    for part in record.stretches:
+        count = max(1, int((part.stop - part.start) * record.dt / seconds + 1e-9))
+        edges = np.linspace(part.start, part.stop, count + 1).round().astype(int).tolist()
         yield from (slice(a, b) for a, b in pairwise(edges))

@@ -183,13 +183,14 @@ def _drive(
     figure: FigureBase, found: Diagnosis, panels: Mapping[str, Mapping[str, FloatArray]], *, narrow: bool
 ) -> None:
     axis, traces = drive_time(found), traces_of(found)
+    runs = traces.runs
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for ax, (name, lines) in zip(axes, panels.items(), strict=True):
         _shade(ax, axis)
         for label, values in lines.items():
             # what was logged does not begin anew with a rollout, and a simulated acceleration does not either
             anew = name == LABELS["speed"] and label not in ("command", "measured")
-            parts = traces.piece if anew else traces.stretch
+            parts = np.repeat(np.arange(len(runs)), [run.stop - run.start for run in runs]) if anew else traces.stretch
             line = envelope(axis.along, values, parts, _INTERVALS[narrow])
             ax.plot(*line, color=_COLOURS[label], lw=0.9, label=label)
         ax.set_ylabel(name)

@@ -15,7 +15,6 @@ from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, GapPlant, plant
 from avtorch.gap.drive_record import Record
 from avtorch.gap.result.traces import Traces
-from avtorch.gap.rollout_errors import rms, rolled_out
 from avtorch.io import Log
 
 
@@ -104,8 +103,7 @@ class Trial:
         left = GapPlant([e for e in car.effects if e.name in on], T_L=car.T_L, K_L=car.K_L, sigma=0.0)
         there = left.parameters()
         left = left.with_values({key: x for key, x in values.items() if key in there})
-        lines = rolled_out(self.record, left)
+        lines = self.record.rolled_out(left)
         if not np.isfinite(lines).all():
             raise InputError("the simulator diverges with these sizes; needs others")
-        errors = rms(self.record, self.record.measured - lines, float(left.T_L))
-        return self.traces.begun_anew(lines.mean(-1)), errors
+        return self.traces.begun_anew(lines.mean(-1)), self.record.rms(self.record.measured - lines)

@@ -10,7 +10,6 @@ import pytest
 from avtorch.errors import InputError
 from avtorch.gap import plant
 from avtorch.gap.drive_record import Record
-from avtorch.gap.rollout_errors import rolled_out
 from avtorch.io import Log
 from tests.gap.records import log_of
 
@@ -54,7 +53,7 @@ def test_drives_are_rolled_out_at_the_logs_rate() -> None:
 def test_the_truth_leaves_nothing_over(rate_hz: int) -> None:
     car = plant(T_L=0.4, K_L=0.9)
     record = Record.of(log_of(car, seconds=40.0, rate_hz=rate_hz, noise=None))
-    errors = record.measured - rolled_out(record, car)
+    errors = record.measured - record.rolled_out(car)
     # the first acceleration, taken from 0.3 s, is forgotten within some lags; what it added to the speed is not
     assert np.abs(errors[0]).max() < 2e-2
     assert np.abs(np.diff(errors[1], axis=0)).max() < 2e-3
@@ -129,8 +128,8 @@ def test_several_logs_are_one_after_another() -> None:
     alone = [Record.of(a), Record.of(b)]
     assert record.rows == sum(r.rows for r in alone)
     np.testing.assert_array_equal(record.measured, np.concatenate([r.measured for r in alone], 1))
-    parts = [rolled_out(r, plant()) for r in alone]
-    np.testing.assert_allclose(rolled_out(record, plant()), np.concatenate(parts, 1), atol=1e-9)
+    parts = [r.rolled_out(plant()) for r in alone]
+    np.testing.assert_allclose(record.rolled_out(plant()), np.concatenate(parts, 1), atol=1e-9)
     np.testing.assert_array_equal(Record.of(iter([a])).source, alone[0].source)
 
 

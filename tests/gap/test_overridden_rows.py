@@ -16,7 +16,6 @@ from avtorch.gap.effects import SpeedDependentGain
 from avtorch.gap.engine.coordinates import EFFECTS
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.rollout_errors import rolled_out
 from avtorch.gap.sensor_noise import with_sensor_noise
 from avtorch.io import Log
 from tests.gap.records import log_of
@@ -77,7 +76,7 @@ def test_a_drivers_rows_change_no_rollout(seed: int) -> None:
     own, other = (Record.of(x) for x in (log, _garbled(log, ("accel_cmd", "accel"), rng)))
     np.testing.assert_array_equal(own.measured, other.measured)
     car = plant([SpeedDependentGain(0.3)])
-    np.testing.assert_array_equal(*(rolled_out(r, car) for r in (own, other)))
+    np.testing.assert_array_equal(*(r.rolled_out(car) for r in (own, other)))
     for one, two in zip(own.drives, other.drives, strict=True):
         assert one.position is not None
         assert two.position is not None
@@ -90,7 +89,7 @@ def test_drives_are_those_of_a_log_without_the_drivers_rows() -> None:
     assert len(own.drives) == len(other.drives) == 4
     np.testing.assert_array_equal(own.source, other.source)
     np.testing.assert_array_equal(own.measured, other.measured)
-    np.testing.assert_array_equal(*(rolled_out(r, plant([DeadTime(0.2)])) for r in (own, other)))
+    np.testing.assert_array_equal(*(r.rolled_out(plant([DeadTime(0.2)])) for r in (own, other)))
 
 
 def test_the_road_runs_on_under_the_driver() -> None:

@@ -6,13 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from avtorch.gap.drive_record import HORIZON_S
 from avtorch.gap.quantity import Quantity, of_fields, plain
 from avtorch.gap.simulator.effect import named_cause
 
-HORIZON_S = 10.0
-"""Of the rollouts whose errors a budget divides [s]."""
-BEGIN_S = 0.5
-"""Over which the measured start of a rollout is averaged [s]."""
 MATERIAL = 0.03
 """Share from which something counts, unless a user says otherwise: a part of the bare baseline's squared error, what is
 unexplained of the gap."""

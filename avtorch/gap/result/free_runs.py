@@ -15,10 +15,9 @@ from itertools import pairwise
 import numpy as np
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
-from avtorch.gap.drive_record import RATE_HZ, MeasuredRows, grouped
+from avtorch.gap.drive_record import HORIZON_S, RATE_HZ, MeasuredRows, free_runs, grouped, runs_over
 from avtorch.gap.engine.drive_data import DriveData, Grid
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.result.budget import BEGIN_S, HORIZON_S
 from avtorch.io import Log
 from avtorch.io.engagement import SETTLE_S
 
@@ -84,18 +83,10 @@ class Blocks:
         return out
 
     def free_runs(self, data: DriveData, errors: FloatArray) -> FloatArray:
-        """Errors (..., channel, row) of readings as those of free runs, begun anew every `HORIZON_S` in each block.
-
-        A speed begins at its measured mean over the first `BEGIN_S`.
-        """
+        """Errors (..., channel, row) of readings as those of free runs, begun anew every `HORIZON_S` in each block."""
         out = errors.copy()
-        if data.speed is None:
-            return out
-        span, begin = round(HORIZON_S / data.dt), max(1, round(BEGIN_S / data.dt))
-        for block in self.rows:
-            for i in range(block.start, block.stop, span):
-                run = out[..., -1, i : min(i + span, block.stop)]
-                run -= run[..., :begin].mean(-1, keepdims=True)
+        if data.speed is not None:
+            out[..., -1, :] = free_runs(errors[..., -1, :], runs_over(self.rows, round(HORIZON_S / data.dt)), data.dt)
         return out
 
 

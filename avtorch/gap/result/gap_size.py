@@ -17,7 +17,6 @@ from scipy.signal import fftconvolve
 from avtorch.arrays import FloatArray
 from avtorch.gap.quantity import plain
 from avtorch.gap.result.free_runs import CountedRows
-from avtorch.gap.rollout_errors import HORIZON_S, reached, rms
 
 WINDOW_S = 10.0
 SETTLED_S = 3.0
@@ -90,12 +89,11 @@ def gap_size(
 ) -> GapSize:
     """Root mean square errors of `none`, the fitted baseline, with those of `best` as floors where smaller.
 
-    (An effect may improve the speed at the cost of the acceleration, and a wrong one often does.) Rollouts start from
-    the measurement at every row, and last `HORIZON_S` or as long as the longest stretch: the measures are those of
-    `shrinkage`, here over all counted rows. None where the log lacks the channel.
+    (An effect may improve the speed at the cost of the acceleration, and a wrong one often does.) The measures of free
+    runs are those of `shrinkage`, here over all counted rows. None where the log lacks the channel.
     """
     one = [] if "accel" not in rows.channels else [_one_step(rows, x.errors[0], x.lag) for x in (none, best)]
-    before, after = (rms(rows, x.errors, none.lag) for x in (none, best))
+    before, after = (rows.rms(x.errors) for x in (none, best))
     return GapSize(
         detected=detected,
         p_value=p_value,
@@ -104,7 +102,7 @@ def gap_size(
         rollout_rmse_accel=before.get("accel"),
         rollout_floor_accel=min(before["accel"], after["accel"]) if "accel" in before else None,
         rollout_rmse_speed=before.get("speed"),
-        horizon_s=reached(rows, HORIZON_S),
+        horizon_s=rows.longest_s,
         repeats=repeatability(rows),
     )
 

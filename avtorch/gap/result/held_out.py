@@ -21,6 +21,7 @@ import numpy as np
 from scipy.special import multigammaln  # pyright: ignore[reportAttributeAccessIssue]
 
 from avtorch.arrays import BoolArray, FloatArray
+from avtorch.gap.drive_record import HORIZON_S
 from avtorch.gap.engine.coordinates import INDEX, base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.family import family_of
@@ -28,7 +29,6 @@ from avtorch.gap.engine.gauss_newton import fit, linear_priors, linearised, pena
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance, whiten
 from avtorch.gap.result.black_box_rest import BlackBox, Predicted
-from avtorch.gap.result.budget import HORIZON_S
 from avtorch.gap.result.free_form import FittedForm
 from avtorch.gap.result.free_runs import Blocks, compared, measured_readings, readings, speed_gained
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from itertools import pairwise
 from typing import Literal, Self
 
 import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
-from avtorch.gap.drive_record import MeasuredRows
-from avtorch.gap.result.budget import BEGIN_S, HORIZON_S
+from avtorch.gap.drive_record import HORIZON_S, MeasuredRows, free_runs, runs_over
 from avtorch.io import Log
 
 Reason = Literal["driver", "standstill", "gap", "settling"]
@@ -87,26 +85,20 @@ class Traces:
         """Measured speed, (row,); None where it was not measured."""
         return self.measured[self.channels.index("speed")] if "speed" in self.channels else None
 
-    @cached_property
-    def piece(self) -> IntArray:
-        """Number (row,) of the rollout of at most `HORIZON_S` that a row belongs to; each stretch begins one."""
-        since = np.concatenate([self.time[rows] - self.time[rows[0]] for rows in self.stretches])
-        begins = (np.diff(self.stretch, prepend=-1) != 0) | (np.diff(since // HORIZON_S, prepend=-1.0) > 0)
-        return np.cumsum(begins) - 1
+    @property
+    def runs(self) -> list[slice]:
+        """Rows of free runs of at most `HORIZON_S`; each stretch begins one."""
+        parts = [slice(int(rows[0]), int(rows[-1]) + 1) for rows in self.stretches]
+        return runs_over(parts, round(HORIZON_S / self.step))
 
     def begun_anew(self, simulated: FloatArray) -> FloatArray:
-        """`simulated` (channel, row), with a speed that begins each `piece` at the measured one, as in the budget: over
-        a whole drive it would drift without end on a car that rolls to a stop where its simulator does not.
+        """`simulated` (channel, row), with a speed that begins each of the `runs` at the measured one: over a whole
+        drive it would drift without end on a car that rolls to a stop where its simulator does not.
         """
         if "speed" not in self.channels:
             return simulated
-        k = self.channels.index("speed")
-        off = self.measured[k] - simulated[k]
-        firsts = np.flatnonzero(np.diff(self.piece, prepend=-1))
-        starts = self.time - self.time[firsts][self.piece] <= BEGIN_S
-        level = np.bincount(self.piece[starts], off[starts]) / np.bincount(self.piece[starts])
-        out = simulated.copy()
-        out[k] += level[self.piece]
+        k, out = self.channels.index("speed"), simulated.copy()
+        out[k] = self.measured[k] - free_runs(self.measured[k] - simulated[k], self.runs, self.step)
         return out
 
     def fit(self, simulated: FloatArray) -> FloatArray:
