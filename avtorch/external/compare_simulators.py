@@ -28,7 +28,6 @@ from os import PathLike, fspath
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
@@ -38,9 +37,9 @@ from avtorch.errors import InputError
 from avtorch.external.external_simulator import ExternalSimulator, Progress
 from avtorch.external.simulator import DrivenPlant
 from avtorch.external.surrogate import Surrogate, surrogate_of
-from avtorch.gap.compare import LEVEL
-from avtorch.gap.drive_record import FEWEST_BLOCKS, HORIZON_S, Record, blocks_of
+from avtorch.gap.compare import LEVEL, check_length, whole_runs
 from avtorch.gap.quantity import Quantity, of_fields, unit_of, words_of
+from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant, plant
@@ -214,27 +213,23 @@ class LogRatio:
 
 @dataclass(frozen=True, eq=False)
 class ScoredBlocks:
-    """`blocks` of a record, by which rollouts of `horizon_s` [s] are scored."""
+    """`blocks` of rows, free runs of `horizon_s` [s], by which simulators are scored."""
 
-    record: Record = field(repr=False)
+    rows: CountedRows = field(repr=False)
     blocks: tuple[slice, ...]
     horizon_s: float
 
     @classmethod
-    def of(cls, record: Record) -> ScoredBlocks:
-        """Those of a record. Raises `InputError` for less than five."""
-        blocks = tuple(blocks_of(record, fewest=FEWEST_BLOCKS))
-        if len(blocks) < FEWEST_BLOCKS:
-            raise InputError(
-                f"logs: found {len(blocks)} blocks of 4 s of usable driving, needs {FEWEST_BLOCKS} or more"
-            )
-        longest = max(block.stop - block.start for block in blocks) * record.dt
-        return cls(record, blocks, min(HORIZON_S, longest))
+    def of(cls, rows: CountedRows) -> ScoredBlocks:
+        """Those of drives. Raises `InputError` where they are less than five times 4 s."""
+        check_length(rows, "logs")
+        horizon, (blocks,) = whole_runs([rows])
+        return cls(rows, tuple(blocks), horizon)
 
     def squares(self, errors: FloatArray) -> dict[str, FloatArray]:
         """Squared errors by metric (block,), of a rollout's `errors` (channel, counted, group)."""
         least = _LEAST**2 * self._rows
-        return {name: np.maximum(x, least) for name, x in self.record.squares(errors, self.blocks).items()}
+        return {name: np.maximum(x, least) for name, x in self.rows.squares(errors, self.blocks).items()}
 
     def log_ratio(self, one: Mapping[str, FloatArray], two: Mapping[str, FloatArray]) -> LogRatio:
         """Of the errors of `two` to those of `one`, squares (block,) by metric; the mean over the metrics."""
@@ -249,7 +244,7 @@ class ScoredBlocks:
 
     @property
     def _rows(self) -> FloatArray:
-        return np.array([(b.stop - b.start) * self.record.group for b in self.blocks], dtype=float)
+        return np.array([(b.stop - b.start) * self.rows.group for b in self.blocks], dtype=float)
 
 
 _SAME = 0.01  # relative difference of parameters that is none
@@ -265,7 +260,7 @@ def differences(
     """
     chains = [surrogate.plant for surrogate in surrogates]
     base, donor = chains[far], chains[1 - far]
-    own = scored.record.rolled_out(base)
+    own = scored.rows.rolled_out(base)
     sides = {name: [_values(surrogate, name) for surrogate in surrogates] for name in _parts(chains)}
     apart = [name for name, (one, two) in sides.items() if not _alike(one, two)]
     known: dict[frozenset[str], LogRatio] = {}
@@ -277,7 +272,7 @@ def differences(
             changed = base
             for name in sorted(names):
                 changed = _with_part(changed, donor, name)
-            moved = errors + own - scored.record.rolled_out(changed) if names else errors
+            moved = errors + own - scored.rows.rolled_out(changed) if names else errors
             known[names] = scored.log_ratio(as_it_is, scored.squares(moved))
         return known[names]
 
@@ -388,8 +383,8 @@ def compare_simulators(
         surrogate_of(outputs, progress=steps) if own is None else Surrogate(own, {})
         for (_, own), (outputs, _) in zip(given, rolled, strict=True)
     ]
-    scored = ScoredBlocks.of(Record.of(cars))
-    errors = [_errors(scored.record, outputs) for outputs, _ in rolled]
+    scored = ScoredBlocks.of(CountedRows.of(cars))
+    errors = [scored.rows.measured - scored.rows.of_logs(outputs) for outputs, _ in rolled]
     one, two = (scored.squares(e) for e in errors)
     both = scored.log_ratio(one, two)
     far = 0 if both.mean < 0 else 1
@@ -445,15 +440,6 @@ def _scored(logs: Sequence[Log], rolled: Sequence[Sequence[Log]]) -> list[Log]:
         replace(log, engaged=log.engaged & one.engaged & two.engaged, **absent)
         for log, one, two in zip(logs, *rolled, strict=True)
     ]
-
-
-def _errors(record: Record, outputs: Sequence[Log]) -> FloatArray:
-    """(channel, counted, group): the car's less the simulator's."""
-    simulated = [
-        record.at_counted_rows([torch.as_tensor(getattr(outputs[cut.log], name)[cut.rows]) for cut in record.cuts])
-        for name in record.channels
-    ]
-    return record.measured - np.stack(simulated)
 
 
 def _told(

@@ -25,7 +25,6 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.gap.drive_record import FEWEST_BLOCKS, HORIZON_S, Record, blocks_of, runs_over
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import jacobian, prior_terms, whitened_jacobian
 from avtorch.gap.engine.joint import JointModel, block_scores
@@ -34,6 +33,7 @@ from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.cause_of_change import cause_of_change, dead_time_test
 from avtorch.gap.result.comparison import Change, ChangeCause, Comparison, DeadTimeTest, SimulatorChange
+from avtorch.gap.result.counted_rows import HORIZON_S, CountedRows, runs_over
 from avtorch.gap.result.diagnosis import BlackBoxSimulator
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.simulator.effect import Effect, chosen_effects
@@ -46,10 +46,10 @@ Simulator = GapPlant | str | PathLike[str] | None
 LEVEL = 0.04
 """Significance level: with one car, "no change" is the right answer in more than 95 % of comparisons."""
 _CAR = ("T_L", "K_L")
-_TURNS = 12  # of Gauss-Newton
+_FEWEST = 5  # blocks on either side, and runs
+_SHORTEST_S = 4.0  # of a block
 _DRAWS = 2000
 _HORIZONS = (HORIZON_S, 5.0, 2.0, 1.0)
-_WHOLE_SHARE = 0.4  # of a side's rows that are in whole runs
 
 
 @shows_progress
@@ -108,7 +108,7 @@ def compare(
         told("lag and gain of both drives", 0, 2)
     fitted = [_LagAndGain.of(logs, plants[0], name) for logs, name in zip(sides, ("before", "after"), strict=True)]
     one, two = fitted
-    if one.record.channels != two.record.channels:
+    if one.rows.channels != two.rows.channels:
         raise InputError("before, after: have different channels; needs accel, speed or both in both")
     away = two.mean - one.mean
     covariance = one.covariance + two.covariance
@@ -130,7 +130,7 @@ def compare(
     simulators = [p if b is not None else one.fitted(plants[0]) for p, b in zip(plants, given, strict=True)]
     facts = [LogFacts.of(logs) for logs in sides]
     same = replace(facts[0], name="") == replace(facts[1], name="")
-    horizon, runs = _whole_runs([side.record for side in fitted])
+    horizon, runs = whole_runs([side.rows for side in fitted])
     gap = _gaps(fitted, simulators, horizon, runs, same=same)
     simulator = _simulator_change(gap)
     changed = p_value < level
@@ -163,27 +163,19 @@ def compare(
 
 @dataclass(frozen=True, eq=False)
 class _LagAndGain:
-    """One set of drives, `record`: `mean` and `covariance` of ln T_L and ln K_L, estimated from `blocks` blocks."""
+    """One set of drives, `rows`: `mean` and `covariance` of ln T_L and ln K_L, estimated from `blocks` blocks."""
 
-    record: Record = field(repr=False)
+    rows: CountedRows = field(repr=False)
     mean: FloatArray
     covariance: FloatArray = field(repr=False)
     blocks: int
 
     @classmethod
     def of(cls, logs: Sequence[Log], base: GapPlant, which: str) -> _LagAndGain:
-        record = Record.of(logs)
-        blocks = blocks_of(record, fewest=FEWEST_BLOCKS)
-        if len(blocks) < FEWEST_BLOCKS:
-            raise InputError(
-                f"{which}: found {len(blocks)} blocks of 4 s of usable driving, needs {FEWEST_BLOCKS} or more"
-            )
-        try:
-            data = DriveData.of(logs)
-        except InputError:  # no stretch that is long enough for the engine
-            mean, information, scores = _by_rows(record, base, blocks)
-        else:
-            mean, information, scores = _by_engine(data, base)
+        data = DriveData.of(logs)
+        rows = CountedRows.of(logs, data)
+        check_length(rows, which)
+        mean, information, scores = _fitted(data, base)
         scores = scores - scores.mean(1, keepdims=True)
         count = scores.shape[1]
         between = scores @ scores.T * count / (count - 1)
@@ -192,14 +184,14 @@ class _LagAndGain:
         # in coordinates that whiten the posterior: the spread is no smaller than the posterior's in any direction
         sizes, axes = np.linalg.eigh(root.T @ between @ root)
         spread = root @ axes @ np.diag(np.maximum(sizes, 1.0)) @ axes.T @ root.T
-        return cls(record, mean, spread[:2, :2], count)
+        return cls(rows, mean, spread[:2, :2], count)
 
     def fitted(self, base: GapPlant) -> GapPlant:
         """The simulator with this lag and gain."""
         return base.with_values(dict(zip(_CAR, np.exp(self.mean).tolist(), strict=True)))
 
 
-def _by_engine(data: DriveData, base: GapPlant) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _fitted(data: DriveData, base: GapPlant) -> tuple[FloatArray, FloatArray, FloatArray]:
     """ln T_L and ln K_L (2,) behind a recorder; information (parameter, parameter) and scores (parameter, block)."""
     alone = data.channel_count == 1
     h = base_fit(data.below(ONE_CHANNEL_HZ) if alone else data, base, alone=alone)
@@ -212,46 +204,22 @@ def _by_engine(data: DriveData, base: GapPlant) -> tuple[FloatArray, FloatArray,
     return np.log(here), information, block_scores(h, h.covariance, J, h.residual) * slopes[:, None]
 
 
-def _by_rows(record: Record, base: GapPlant, blocks: Sequence[slice]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The same of rows with white noise of any covariance, for stretches that are too short for a spectrum."""
-
-    def errors(z: FloatArray) -> FloatArray:
-        """(channel, row): of acceleration, and of the speed's rise between rows."""
-        car = base.with_values(dict(zip(_CAR, np.exp(z).tolist(), strict=True)))
-        e = (record.measured - record.rolled_out(car)).mean(-1)
-        for k, channel in enumerate(record.channels):
-            if channel == "speed":
-                e[k] = np.diff(e[k], prepend=e[k, :1]) / record.dt
-                e[k, record.starts] = 0.0
-        return e
-
-    z: FloatArray = np.log([float(base.T_L), float(base.K_L)])
-    information: FloatArray = np.eye(2)
-    scores: FloatArray = np.zeros((2, record.rows))
-    step = 1e-3
-    for _ in range(_TURNS):
-        e = errors(z)
-        weight = np.asarray(np.linalg.inv(e @ e.T / e.shape[1]), np.float64)
-        J = np.stack([(e - errors(z + step * unit)) / step for unit in np.eye(2)])
-        weighted = np.einsum("pct,cd->pdt", J, weight)
-        information = np.einsum("pdt,qdt->pq", weighted, J) + np.eye(2)
-        scores = np.einsum("pdt,dt->pt", weighted, e)
-        z = z + np.clip(np.asarray(np.linalg.solve(information, scores.sum(1)), np.float64), -0.5, 0.5)
-    return z, information, np.stack([scores[:, b].sum(1) for b in blocks], 1)
+def check_length(rows: CountedRows, which: str) -> None:
+    """Raises `InputError` for less than five blocks of 4 s."""
+    blocks = int(rows.rows * rows.dt / _SHORTEST_S)
+    if blocks < _FEWEST:
+        raise InputError(f"{which}: found {blocks} blocks of 4 s of usable driving, needs {_FEWEST} or more")
 
 
-def _whole_runs(records: Sequence[Record]) -> tuple[float, list[list[slice]]]:
-    """Length of the free runs [s], up to `HORIZON_S`, and the runs of each side. Errors grow with the length: it is the
-    longest of which both sides hold enough that are whole."""
+def whole_runs(sides: Sequence[CountedRows]) -> tuple[float, list[list[slice]]]:
+    """Length of the free runs [s], up to `HORIZON_S`, and the whole runs of each side: errors grow with the length, so
+    it is the longest of which all sides hold enough."""
     horizon, each = _HORIZONS[-1], []
     for horizon in _HORIZONS:
-        rows = [round(horizon / record.dt) for record in records]
-        each = [
-            [run for run in runs_over(record.stretches, n) if run.stop - run.start == n]
-            for record, n in zip(records, rows, strict=True)
-        ]
-        whole = zip(each, rows, records, strict=True)
-        if all(len(runs) >= max(FEWEST_BLOCKS, _WHOLE_SHARE * record.rows / n) for runs, n, record in whole):
+        rows = [round(horizon / side.dt) for side in sides]
+        cut = [runs_over(side.stretches, n) for side, n in zip(sides, rows, strict=True)]
+        each = [[run for run in runs if run.stop - run.start == n] for runs, n in zip(cut, rows, strict=True)]
+        if min(map(len, each)) >= _FEWEST:
             break
     return horizon, each
 
@@ -267,7 +235,7 @@ def _gaps(
     """Errors of free runs before and after, by metric; the `same` drives have the same bootstrap draws."""
     drawn: list[dict[str, FloatArray]] = []
     for i, (side, simulator, own) in enumerate(zip(sides, simulators, runs, strict=True)):
-        record, count = side.record, len(own)
+        record, count = side.rows, len(own)
         squares = record.squares(record.measured - record.rolled_out(simulator), own, horizon)
         weights = np.random.default_rng(0 if same else i).multinomial(count, np.full(count, 1 / count), size=_DRAWS)
         weights = np.concatenate([np.ones((1, count)), weights])

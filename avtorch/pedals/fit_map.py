@@ -19,8 +19,8 @@ from scipy.signal import lfilter
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.gap.drive_record import HORIZON_S
 from avtorch.gap.engine.priors import FAINT_MAP
+from avtorch.gap.result.counted_rows import HORIZON_S
 from avtorch.gap.result.free_form import (
     GAIN_SD,
     SIZES,

@@ -14,9 +14,9 @@ from matplotlib.ticker import PercentFormatter
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
-from avtorch.gap.drive_record import HORIZON_S
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.budget import LIKELY, UNITS, Axis, Budget, percent
+from avtorch.gap.result.counted_rows import HORIZON_S
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.hypotheses import Candidate
 from avtorch.gap.result.traces import Traces

@@ -13,7 +13,7 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, GapPlant, plant
-from avtorch.gap.drive_record import Record
+from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.result.traces import Traces
 from avtorch.io import Log
 
@@ -45,7 +45,7 @@ class Trial:
         0.2
     """
 
-    record: Record = field(repr=False)
+    rows: CountedRows = field(repr=False)
     base: GapPlant
     car: GapPlant
 
@@ -60,13 +60,13 @@ class Trial:
         except (OSError, ValueError, KeyError, TypeError) as fault:
             raise InputError(f"{answer / 'diagnosis.json'}: cannot be read ({fault})") from None
         base, repaired = plant([], T_L=lag, K_L=gain, sigma=0.0), answer / "plant.toml"
-        return cls(Record.of(log), base, plant([], baseline=repaired) if repaired.exists() else base)
+        return cls(CountedRows.of(log), base, plant([], baseline=repaired) if repaired.exists() else base)
 
     @property
     def traces(self) -> Traces:
         """What was measured."""
-        measured = self.record.measured
-        return Traces.of(self.record, measured, measured, np.zeros(self.record.rows))
+        measured = self.rows.measured
+        return Traces.of(self.rows, measured, measured, np.zeros(self.rows.rows))
 
     def sizes(self, car: GapPlant) -> dict[str, Size]:
         """What can be moved, by the names of `GapPlant.parameters`."""
@@ -81,7 +81,7 @@ class Trial:
 
     def addable(self) -> list[str]:
         """Effects that the car lacks and a rollout can show."""
-        own, channels = {e.name for e in self.car.effects}, self.record.channels
+        own, channels = {e.name for e in self.car.effects}, self.rows.channels
         return [
             name
             for name, kind in sorted(EFFECTS.items())
@@ -93,7 +93,7 @@ class Trial:
 
     def with_effect(self, car: GapPlant, name: str) -> GapPlant:
         """`car` with one more effect, of typical size."""
-        return plant([EFFECTS[name]], baseline=car).prepared(*self.record.drives, fitted=[name])
+        return plant([EFFECTS[name]], baseline=car).prepared(*self.rows.drives, fitted=[name])
 
     def rollout(
         self, car: GapPlant, on: Collection[str], values: Mapping[str, float]
@@ -103,7 +103,7 @@ class Trial:
         left = GapPlant([e for e in car.effects if e.name in on], T_L=car.T_L, K_L=car.K_L, sigma=0.0)
         there = left.parameters()
         left = left.with_values({key: x for key, x in values.items() if key in there})
-        lines = self.record.rolled_out(left)
+        lines = self.rows.rolled_out(left)
         if not np.isfinite(lines).all():
             raise InputError("the simulator diverges with these sizes; needs others")
-        return self.traces.begun_anew(lines.mean(-1)), self.record.rms(self.record.measured - lines)
+        return self.traces.begun_anew(lines.mean(-1)), self.rows.rms(self.rows.measured - lines)

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -14,10 +13,8 @@ from avtorch.gap.compare import _explanation
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import DeadTimeTest
 from avtorch.io import Log
-from avtorch.report.comparison import comparison_tables
 from tests.bars import student
 from tests.gap.records import QUIET, log_of
-from tests.overridden import taken_over
 
 LONG_S, LONG_BLOCKS = 200.0, 19  # blocks of 10 s, behind two in which the drive settles
 
@@ -122,27 +119,6 @@ def test_two_simulators_on_one_drive(rotating_seed: int) -> None:
     # other rows count: no longer one drive
     hand = replace(log, engaged=log.time > 20.0)
     assert "drive" not in avtorch.compare(log, hand, baseline=plant(T_L=0.4, K_L=0.9), effects=[]).why.partition(".")[0]
-
-
-@pytest.mark.slow
-@pytest.mark.statistical
-def test_rollouts_of_both_sides_last_as_long_as_they_are_said_to(rotating_seed: int) -> None:
-    """Between overrides every 9 s no run lasts 10 s, and errors grow with how long they do: once those of 6 s were
-    called 10 s, and held against 10 s of a drive without overrides. Only whole ones count."""
-    rng = np.random.default_rng(rotating_seed)
-    weak = partial(taken_over, seconds=90.0, rng=rng, brake_gain_ratio=0.7)
-    often, never = weak(overrides=[(8.0 + 9 * k, 10.0 + 9 * k) for k in range(9)]), weak(overrides=())
-    simulator = plant(T_L=0.35, K_L=1.0)
-    told, whole = (avtorch.compare(x, never, baseline=simulator) for x in (often, never))
-    # stretches of 7 s, of which two settle the car
-    assert told.horizon_s == 5.0
-    assert told.to_dict()["horizon_s"] == told.horizon_s
-    assert whole.horizon_s == 10.0
-    # the speed lost by braking less adds up
-    assert told.gap["rollout_rmse_speed"].after.mean < whole.gap["rollout_rmse_speed"].after.mean
-    shown = " ".join(cell for table in comparison_tables(told) for row in table.rows for cell in row)
-    assert "speed error, 5 s [m/s]" in shown
-    assert "10 s" not in shown
 
 
 def test_wrong_input_is_refused() -> None:

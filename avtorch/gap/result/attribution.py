@@ -24,7 +24,7 @@ from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import EFFECT_NATS
 from avtorch.gap.result.budget import Axis, Location
-from avtorch.gap.result.free_runs import CountedRows
+from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
 _MOST = 0.95  # share of the cause's effect that a part holds
@@ -179,8 +179,8 @@ def _band(attribution: RowAttribution) -> Iterator[Part]:
     record = attribution.record
     accel = attribution.moved[0] if "accel" in record.channels else np.gradient(attribution.moved[-1]) / record.dt
     power, f = np.zeros(0), np.zeros(0)
-    for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
-        x = accel[first:last]
+    for part in record.stretches:
+        x = accel[part]
         power = np.concatenate([power, np.abs(np.fft.rfft(x * np.hanning(len(x))))[1:] ** 2])
         f = np.concatenate([f, np.fft.rfftfreq(len(x), record.dt)[1:]])
     if not power.sum() > 0:

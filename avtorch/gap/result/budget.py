@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from avtorch.gap.drive_record import HORIZON_S
 from avtorch.gap.quantity import Quantity, of_fields, plain
+from avtorch.gap.result.counted_rows import HORIZON_S
 from avtorch.gap.simulator.effect import named_cause
 
 MATERIAL = 0.03

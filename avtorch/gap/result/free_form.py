@@ -29,12 +29,12 @@ from scipy.linalg import block_diag
 from scipy.signal import lfilter
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
-from avtorch.gap.drive_record import HORIZON_S
 from avtorch.gap.engine.force_map import ForceMap
 from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.hypothesis import Hypothesis, plant_of
 from avtorch.gap.engine.priors import MAP_SIZE
 from avtorch.gap.engine.sample import sample
+from avtorch.gap.result.counted_rows import HORIZON_S
 from avtorch.gap.result.output_error import SETTLED_S, STEP_S, Coefficients, Rows, Runs
 from avtorch.gap.simulator.chain import at_place
 from avtorch.gap.simulator.effect import EffectContext

@@ -40,8 +40,7 @@ from avtorch.gap.result.budget import (
     Unexplained,
 )
 from avtorch.gap.result.free_form import FittedForm
-from avtorch.gap.result.free_runs import Blocks
-from avtorch.gap.result.held_out import HeldOut
+from avtorch.gap.result.held_out import Blocks, HeldOut
 from avtorch.gap.result.hypotheses import AnswerPart, aliases_of, implausible, map_size, onset_of, part_probability
 from avtorch.gap.result.parameters import ParameterPosterior
 from avtorch.gap.simulator.effect import EFFECTS as TABLE

@@ -16,7 +16,7 @@ from scipy.signal import fftconvolve
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.quantity import plain
-from avtorch.gap.result.free_runs import CountedRows
+from avtorch.gap.result.counted_rows import CountedRows
 
 WINDOW_S = 10.0
 SETTLED_S = 3.0
@@ -114,7 +114,7 @@ def _one_step(record: CountedRows, errors: FloatArray, lag: float) -> float:
     error of its zero-order hold from the measured acceleration.
     """
     keep = float(np.exp(-record.dt / record.group / lag))
-    steps = [x[1:] - keep * x[:-1] for x in map(np.ravel, np.split(errors, record.starts[1:]))]
+    steps = [x[1:] - keep * x[:-1] for x in (errors[part].ravel() for part in record.stretches)]
     return float(np.sqrt((np.concatenate(steps) ** 2).mean()))
 
 

@@ -8,6 +8,23 @@ products B, held out,
     log p(B | A) = n/2 log det A - (n + m)/2 log det (A + B) + log Gamma_C((n + m)/2) - log Gamma_C(n/2) - m C/2 log pi
 
 (matrix Student; Gelman et al. 2013, 3.6). No free run foretells which messages are lost, so all have arrived.
+
+Commands, and the speed that effects read, are the log's. Blocks are groups of neighbouring hops of the lapped
+transform's frames, dealt into folds; with several drives of similar length whole drives are held out. Frames that reach
+into a held-out block teach nothing.
+
+What a black box still foretells of held-out blocks: a bound on what any model could.
+
+    r = X beta + n,    beta ~ N(0, sd^2),    X: what forces that commands, speed and time could make do to all channels
+
+r is what a hypothesis leaves, in lapped coefficients; the noise's covariance is free in every band and estimated anew,
+as everywhere. Columns look back only, over the whole band: in a closed loop a command answers the noise of the moment,
+and the cross terms cancel over all frequencies (Ljung 1999, 13.4). A regression of the errors of free runs themselves
+would foretell noise from its echo. A force shows in both channels, a fault of the accelerometer in its own alone.
+
+Columns are of size one and stand in three sets, each with those before it. Sets and prior sizes are averaged by their
+evidence from the taught blocks, so the regression vanishes where there is no structure (MacKay 1992). What it could
+have missed is the spread of its posterior.
 """
 
 from __future__ import annotations
@@ -16,27 +33,131 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import multigammaln  # pyright: ignore[reportAttributeAccessIssue]
 
-from avtorch.arrays import BoolArray, FloatArray
-from avtorch.gap.drive_record import HORIZON_S
+from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.gap.engine.coordinates import INDEX, base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.family import family_of
+from avtorch.gap.engine.free_forms import band_products
 from avtorch.gap.engine.gauss_newton import fit, linear_priors, linearised, penalty
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance, whiten
-from avtorch.gap.result.black_box_rest import BlackBox, Predicted
+from avtorch.gap.result.counted_rows import HORIZON_S, free_runs, readings, runs_over, speed_gained
 from avtorch.gap.result.free_form import FittedForm
-from avtorch.gap.result.free_runs import Blocks, compared, measured_readings, readings, speed_gained
+
+FOLDS = 5
+FEWEST = 5
+"""Blocks without which nothing is held out."""
+_LEAST_TAUGHT = 3  # frames: one more than channels, or a band's covariance is not known
+_BLOCKS = 20  # of a long drive
+_DRIVES = 3  # fewest drives of which whole ones are held out, none of them longer than half of all
 
 _STEPS = 3  # of a fold's fit
 _DAMPED = (1.0, 0.3, 0.1)  # of a step that loses
 _RANDOM = "command_hold"  # the one effect of a plant that chance decides
 
+_LAGS_S = (0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
+_SMOOTH_S = 0.5  # of the speed: little of the noise of the moment is in it
+_LINEAR, _MAP, _TIME = range(3)  # sets of columns, each with those before it
+_BODY, _ACCEL, _SPEED = range(3)  # where a column acts
+_PRIOR_SD = np.geomspace(0.001, 3.0, 12)  # of a coefficient [m/s²]
+_POOLED = (1, 200)  # coefficients a channel that tell a band's noise: free bands swallow what few coefficients show
+_ROUNDS = 4  # alternations between coefficients and noise
+_BOX_DRAWS = 200  # of the posterior
+_LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
 
+
+# blocks ---------------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Blocks of rows, in order, and the `fold` (block,) that holds each out. Of frames: the block (frame,) of their
+    first hop, and the folds' masks `taught` (fold, frame). `by_drives`: folds are whole drives.
+
+    """
+
+    rows: tuple[slice, ...]
+    fold: IntArray
+    block_of_frame: IntArray = field(repr=False)
+    taught: BoolArray = field(repr=False)
+    by_drives: bool = False
+
+    @classmethod
+    def of(cls, data: DriveData) -> Blocks | None:
+        """The blocks of the drives; None where there are fewer than `FEWEST`, or frames too few to teach."""
+        M = data.frame_rows
+        hops = sum(count + 1 for _, count in data.frames)
+        most = max(hops // FEWEST, 1)  # hops of a block
+        size = min(max(2, math.ceil(HORIZON_S / data.hop_s), round(hops / _BLOCKS)), most)  # of 1, two frames are lost
+        rows: list[slice] = []
+        touched: list[tuple[int, int]] = []  # first and last block of each frame
+        for first, count in data.frames:
+            parts = max(1, round((count + 1) / size))
+            edges = np.round(np.linspace(0, count + 1, parts + 1)).astype(int)
+            block = len(rows) + np.repeat(np.arange(parts), np.diff(edges))
+            touched += pairwise(block.tolist())
+            rows += [slice(first + int(a) * M, first + int(b) * M) for a, b in pairwise(edges)]
+        if len(rows) < FEWEST:
+            return None
+        fold, by_drives = _folds(data, rows)
+        frames = np.array(touched)[data.used]
+        taught = np.array([(fold[frames] != k).all(1) for k in range(fold.max() + 1)])
+        if taught.sum(1).min() < _LEAST_TAUGHT:
+            return None
+        return cls(tuple(rows), fold, frames[:, 0], taught, by_drives)
+
+    @property
+    def sizes(self) -> FloatArray:
+        """Rows (block,)."""
+        return np.array([rows.stop - rows.start for rows in self.rows], float)
+
+    def sums(self, x: FloatArray) -> FloatArray:
+        """Sums (..., block) over each block's rows of `x` (..., row)."""
+        return np.stack([x[..., rows].sum(-1) for rows in self.rows], -1)
+
+    def stitched(self, of_folds: Sequence[FloatArray] | FloatArray) -> FloatArray:
+        """(channel, row): each block's by the fit that was made without it; 0 outside."""
+        out = np.zeros_like(of_folds[0])
+        for rows, k in zip(self.rows, self.fold, strict=True):
+            out[:, rows] = of_folds[k][:, rows]
+        return out
+
+    def free_runs(self, data: DriveData, errors: FloatArray) -> FloatArray:
+        """Errors (..., channel, row) of readings as those of free runs, begun anew every `HORIZON_S` in each block."""
+        out = errors.copy()
+        if data.speed is not None:
+            out[..., -1, :] = free_runs(errors[..., -1, :], runs_over(self.rows, round(HORIZON_S / data.dt)), data.dt)
+        return out
+
+
+def _folds(data: DriveData, rows: Sequence[slice]) -> tuple[IntArray, bool]:
+    """The fold (block,) of each block: whole logs, about equal shares of the rows, or every so-many-th block."""
+    log = data.log[[b.start for b in rows]]
+    sizes = np.bincount(log, [b.stop - b.start for b in rows])
+    drives = [int(k) for k in np.argsort(-sizes, kind="stable") if sizes[k] > 0]
+    if len(drives) < _DRIVES or sizes.max() > 0.5 * sizes.sum():
+        return np.arange(len(rows)) % min(FOLDS, len(rows)), False
+    held, fold = np.zeros(min(FOLDS, len(drives))), np.zeros(len(sizes), np.int64)
+    for k in drives:
+        fold[k] = held.argmin()
+        held[fold[k]] += sizes[k]
+    return fold[log], True
+
+
+def measured_readings(data: DriveData) -> FloatArray:
+    """(channel, row)."""
+    return np.stack([x for x in (data.accel, data.speed) if x is not None])
+
+
+def compared(data: DriveData, rows: FloatArray) -> list[FloatArray]:
+    """Readings (channel, row) as the channels that the likelihood compares: acceleration and differenced speed."""
+    return data.channel_rows(None if data.accel is None else rows[0], None if data.speed is None else rows[-1])
+
+
+# held out -------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Scores:
     """Of one model: sums of squared errors of free runs (channel, block) [(m/s²)², (m/s)²], and of log densities
@@ -51,7 +172,7 @@ class HeldOut:
     """A chain of nested hypotheses on blocks that taught neither their parameters nor their noise.
 
     `steps`: scores of each hypothesis of `chain`, then of the last one with the `free` form, if there is one; `rival`,
-    `ceiling`: of the last and the first hypothesis with a black box on top (`black_box_rest`); `floor`: the rival's, no
+    `ceiling`: of the last and the first hypothesis with a `BlackBox` on top; `floor`: the rival's, no
     higher than the last step. `possible` (draw, channel, block): squares of free runs of what the black box may have
     missed. `horizon_s` of the free runs. `apart`: of the last step without a family of causes, by its name, everything
     else refitted.
@@ -312,3 +433,213 @@ def _log_density(taught: DriveData, residual: FloatArray, held_out: FloatArray) 
     log_det, joint = np.linalg.slogdet(A)[1], np.linalg.slogdet(A + B)[1]
     constant = multigammaln(0.5 * (n + m), C) - multigammaln(0.5 * n, C) - 0.5 * m * C * math.log(math.pi)
     return (0.5 * n * log_det - 0.5 * (n + m) * joint + constant).sum(-1)
+
+
+# the black box --------------------------------------------------------------------------------------------------------
+class Predicted(NamedTuple):
+    """By the fit without each fold: `readings` (fold, channel, row), `coefficients` (fold, channel, frame, bin), and
+    `possible` (draw, channel, block): draws of the squares of free runs of what may be there."""
+
+    readings: FloatArray
+    coefficients: FloatArray
+    possible: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class BlackBox:
+    """Columns beside a hypothesis, each in a set `kind` (column,), and the `readings` (column, channel, row) and
+    `coefficients` (column, channel, frame, bin) that they make."""
+
+    hypothesis: Hypothesis
+    kind: IntArray = field(repr=False)
+    readings: FloatArray = field(repr=False)
+    coefficients: FloatArray = field(repr=False)
+
+    @classmethod
+    def of(cls, h: Hypothesis) -> BlackBox:
+        """The columns that commands, speed, time and the hypothesis's own response make."""
+        signals = _signals(h)
+        places = [(_BODY, _forces(h.data, signals))]
+        if h.data.channel_count == 2:
+            places += [(_ACCEL, _of_accelerometer(signals)), (_SPEED, _of_speed(signals))]
+        each = [(place, kind, x) for place, sets in places for kind, columns in enumerate(sets) for x in columns]
+        shown = np.stack([_shown(h, place, x) for place, _, x in each])
+        coefficients = np.stack([h.data.transform(compared(h.data, x)) for x in shown])
+        return cls(h, np.array([kind for _, kind, _ in each]), shown, coefficients)
+
+    def predict(self, residuals: FloatArray, errors: FloatArray, blocks: Blocks) -> Predicted:
+        """What the columns foretell of each fold's blocks, taught by the `residuals` (fold, channel, frame, bin) of the
+        other blocks alone. `errors` (channel, row): of readings, each block's by the fit without it."""
+        h, X = self.hypothesis, self.coefficients
+        rng = np.random.default_rng(0)
+        normal, uniform = rng.standard_normal((_BOX_DRAWS, len(X))), rng.random(_BOX_DRAWS)
+        runs, left = blocks.free_runs(h.data, self.readings), blocks.free_runs(h.data, errors)
+        before = blocks.sums(left**2).sum(1) + 1e-12
+        alike = [(blocks.taught == pattern[:, None]).all(0) for pattern in np.unique(blocks.taught, axis=1).T]
+        products = [band_products(h.data, X[:, :, frames]) for frames in alike]
+        means = np.zeros((1 + len(_POOLED), len(blocks.taught), len(X)))  # the first foretells nothing
+        possible = np.zeros((_BOX_DRAWS, h.data.channel_count, len(blocks.rows)))
+        gains = np.zeros(means.shape[:2])
+        for k, frames in enumerate(blocks.taught):
+            own = np.sum([x for x, group in zip(products, alike, strict=True) if frames[group].all()], axis=0)
+            taught = _TaughtProducts.of(h.data.only(frames), own, X[:, :, frames], residuals[k][:, frames])
+            draws = means[0]
+            for i, least in enumerate(_POOLED, 1):
+                means[i, k], draws = taught.posterior(self.kind, least, normal, uniform)
+            for b in np.flatnonzero(blocks.fold == k):
+                for c in range(runs.shape[1]):
+                    part = runs[:, c, blocks.rows[b]]
+                    gram, match = part @ part.T, part @ left[c, blocks.rows[b]]
+                    possible[:, c, b] = ((draws @ gram) * draws).sum(1)
+                    gains[:, k] += (2 * means[:, k] @ match - ((means[:, k] @ gram) * means[:, k]).sum(1)) / before[c]
+        others = gains.sum(1, keepdims=True) - gains
+        rows = [np.tensordot(means[way, k], self.readings, 1) for k, way in enumerate(others.argmax(0))]
+        coefficients = [h.data.transform(compared(h.data, x)) for x in rows]
+        return Predicted(np.stack(rows), np.stack(coefficients), possible)
+
+
+class _TaughtProducts(NamedTuple):
+    """Products over taught frames, in each band: of columns (band, channel, channel, column, column), of columns and
+    residual (band, channel, channel, column), of the residual (band, channel, channel)."""
+
+    data: DriveData
+    columns: FloatArray
+    mixed: FloatArray
+    residual: FloatArray
+
+    @classmethod
+    def of(cls, data: DriveData, columns: FloatArray, X: FloatArray, residual: FloatArray) -> _TaughtProducts:
+        edges = data.band_edges[:-1]
+        mixed = np.einsum("pcfk,dfk->cdpk", X, residual, optimize=True)
+        squares = np.einsum("cfk,dfk->cdk", residual, residual)
+        return cls(
+            data,
+            columns,
+            np.moveaxis(np.add.reduceat(mixed, edges, axis=-1), -1, 0),
+            np.moveaxis(np.add.reduceat(squares, edges, axis=-1), -1, 0),
+        )
+
+    def posterior(
+        self, kind: IntArray, least: int, normal: FloatArray, uniform: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Mean (column,) and draws (draw, column) of the coefficients, from standard normal (draw, column) and uniform
+        (draw,) numbers."""
+        variance = _PRIOR_SD**2
+        mean, pooling = np.zeros(len(kind)), _pooling(self.data.band_size, least)
+        for _ in range(_ROUNDS):
+            weights = np.linalg.inv(self._noise(mean, pooling))
+            gram, match = np.tensordot(weights, self.columns, 3), np.tensordot(weights, self.mixed, 3)
+            axes, logs, means = [], [], []
+            for last in (_LINEAR, _MAP, _TIME):
+                use = kind <= last
+                values, vectors = np.linalg.eigh(gram[np.ix_(use, use)])
+                own = vectors.T @ match[use]
+                taken = variance[:, None] / (1 + variance[:, None] * np.maximum(values, 0.0))  # posterior variances
+                logs.append(0.5 * (own**2 * taken + np.log(taken / variance[:, None])).sum(1))
+                whole = np.zeros((len(kind), len(values)))
+                whole[use] = vectors
+                axes.append((whole, taken))
+                means.append((own * taken) @ whole.T)
+            log = np.concatenate(logs)
+            chance = np.exp(log - np.logaddexp.reduce(log))
+            mean = chance @ np.concatenate(means)
+        drawn = np.minimum(np.searchsorted(np.cumsum(chance), uniform), len(chance) - 1)
+        draws = np.concatenate(means)[drawn]
+        for i, at in enumerate(drawn):
+            whole, taken = axes[at // len(variance)]
+            draws[i] += whole @ (np.sqrt(taken[at % len(variance)]) * normal[i, : whole.shape[1]])
+        return mean, draws
+
+    def _noise(self, mean: FloatArray, pooling: FloatArray) -> FloatArray:
+        """Covariance (band, channel, channel) of what coefficients (column,) leave, pooled over bands."""
+        mixed = self.mixed @ mean
+        S = self.residual - mixed - mixed.transpose(0, 2, 1) + (self.columns @ mean) @ mean
+        S = np.tensordot(pooling, S, 1)
+        return S + _LEAST * np.trace(S, axis1=1, axis2=2)[:, None, None] * np.eye(S.shape[1])
+
+
+def _pooling(counts: IntArray, least: int) -> FloatArray:
+    """(band, band): sums over bands to means over as many neighbours as have `least` coefficients together."""
+    out, at = np.zeros((len(counts), len(counts))), np.arange(len(counts))
+    for b in at:
+        near = np.abs(at - b) <= next((w for w in at if counts[np.abs(at - b) <= w].sum() >= least), len(at))
+        out[b, near] = 1 / counts[near].sum()
+    return out
+
+
+# what is shown -------------------------------------------------------------------------------------------------------
+def _shown(h: Hypothesis, place: int, x: FloatArray) -> FloatArray:
+    """Readings (channel, row) that a force (row,) [m/s²], or an error of the accelerometer or of the speed, makes."""
+    if place != _BODY:
+        out = np.zeros((2, len(x)))
+        out[0 if place == _ACCEL else 1] = x
+        return out
+    acts = x[h.data.grid.row]
+    return readings(h, acts, speed_gained(h.data.grid, acts))
+
+
+# columns -------------------------------------------------------------------------------------------------------------
+class _Signals(NamedTuple):
+    """Of rows, in units of their spread: command (in that of `a`), the body's acceleration and its slopes, the speed
+    (centred); time runs from -1 to 1."""
+
+    u: FloatArray
+    a: FloatArray
+    jerk: FloatArray
+    snap: FloatArray
+    v: FloatArray
+    t: FloatArray
+
+
+def _signals(h: Hypothesis) -> _Signals:
+    data = h.data
+    gained = h.on_grid()[1][np.searchsorted(data.grid.row, np.arange(len(data.time)))]
+
+    def back(x: FloatArray) -> FloatArray:
+        """Slope over the row before."""
+        out = np.diff(x, prepend=x[:1]) / np.diff(data.time, prepend=data.time[0] - data.dt)
+        out[data.starts] = 0.0
+        return out
+
+    a = back(gained)
+    jerk = data.low_pass(back(a), 0.1)
+    snap = data.low_pass(back(jerk), 0.1)
+    u = np.where(data.starts, data.command, np.roll(data.command, 1))
+    v = data.low_pass(data.smooth_speed, _SMOOTH_S)
+    t = 2 * (data.time - data.time.mean()) / max(float(np.ptp(data.time)), 1e-9)
+    spread = max(float(a.std()), 1e-3)
+    return _Signals(u / spread, a / spread, _unit(jerk), _unit(snap), (v - v.mean()) / max(float(v.std()), 0.1), t)
+
+
+def _unit(x: FloatArray) -> FloatArray:
+    return x / max(float(x.std()), 1e-9)
+
+
+Sets = tuple[list[FloatArray], list[FloatArray], list[FloatArray]]
+"""Columns (row,) in sets: linear in command and response, maps, and what changes with time."""
+
+
+def _forces(data: DriveData, signals: _Signals) -> Sets:
+    u, a, jerk, snap, v, t = signals
+    lp = data.low_pass
+    linear = [np.ones_like(a), u, a, jerk, snap, *(lp(u, lag) for lag in _LAGS_S)]
+    one_sided = [np.minimum(a, 0.0), np.where(a < 0, jerk, 0.0), *(lp(np.minimum(u, 0.0), lag) for lag in (0.2, 0.8))]
+    play = [np.tanh(4 * a), np.tanh(jerk), lp(np.tanh(4 * jerk), 0.3)]
+    speed = [*_hats(v, 5), *(a * x for x in _hats(v, 5)), jerk * v]
+    return linear, [*one_sided, *play, *_hats(a, 9), *speed], [t, t**2, a * t, a * t**2, a * t**3]
+
+
+def _of_accelerometer(signals: _Signals) -> Sets:
+    _, a, jerk, snap, v, t = signals
+    return [np.ones_like(a), a, jerk, snap], [np.minimum(a, 0.0), *_hats(v, 3), a * v, np.tanh(jerk)], [t, a * t]
+
+
+def _of_speed(signals: _Signals) -> Sets:
+    _, a, _, _, v, _ = signals
+    return [a], [np.minimum(a, 0.0), a * v, *_hats(v, 3)], []
+
+
+def _hats(x: FloatArray, count: int) -> list[FloatArray]:
+    """Linear splines (row,) that sum to one, on equidistant knots over the range of `x`: nothing extrapolates."""
+    at = (count - 1) * (x - x.min()) / max(float(np.ptp(x)), 1e-9)
+    return [np.maximum(1 - np.abs(at - k), 0.0) for k in range(count)]

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
-from avtorch.gap.drive_record import HORIZON_S
+from avtorch.gap.result.counted_rows import HORIZON_S
 
 STEP_S = 0.1
 """Step of the runs [s]: a command is averaged over it, and lags are exact."""

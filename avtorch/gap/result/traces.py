@@ -10,7 +10,7 @@ from typing import Literal, Self
 import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
-from avtorch.gap.drive_record import HORIZON_S, MeasuredRows, free_runs, runs_over
+from avtorch.gap.result.counted_rows import HORIZON_S, CountedRows, free_runs, runs_over
 from avtorch.io import Log
 
 Reason = Literal["driver", "standstill", "gap", "settling"]
@@ -62,7 +62,7 @@ class Traces:
 
     @classmethod
     def of(
-        cls, rows: MeasuredRows, before: FloatArray, after: FloatArray, does: FloatArray, logs: Sequence[Log] = ()
+        cls, rows: CountedRows, before: FloatArray, after: FloatArray, does: FloatArray, logs: Sequence[Log] = ()
     ) -> Self:
         """Of counted rows; `before`, `after` (channel, row, group): the simulator's. `logs`: for what did not count."""
         measured, before, after = (x.mean(-1) for x in (rows.measured, before, after))
@@ -114,7 +114,7 @@ class Traces:
         return 100 * (1 - np.divide(error, spread, out=np.full_like(error, np.nan), where=spread > 0))
 
 
-def uncounted(logs: Sequence[Log], record: MeasuredRows) -> tuple[Uncounted, ...]:
+def uncounted(logs: Sequence[Log], record: CountedRows) -> tuple[Uncounted, ...]:
     """What `record`, made of these `logs`, does not count, in order of time."""
     found: list[Uncounted] = []
     for number, counted in enumerate(np.unique(record.log).tolist()):

@@ -10,9 +10,7 @@ import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.gap import DeadTime, Effect, SimulatorInput, plant
-from avtorch.gap.drive_record import BEGIN_S, HORIZON_S
-from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.result.free_runs import CountedRows
+from avtorch.gap.result.counted_rows import BEGIN_S, HORIZON_S, CountedRows
 from avtorch.gap.result.gap_size import Simulated, gap_size
 from avtorch.io import Log
 from avtorch.io.engagement import SETTLE_S
@@ -40,7 +38,7 @@ def drive(effects: Sequence[Effect] = (), *, rate_hz: int = 20, seconds: float =
 def rows_of(log: Log, channels: Sequence[str] = BOTH) -> CountedRows:
     shown = {name: getattr(log, name) for name in channels}
     own = Log.from_arrays(time=log.time, accel_cmd=log.accel_cmd, **shown)
-    return CountedRows.of(DriveData.of(own), (own,))
+    return CountedRows.of(own)
 
 
 @pytest.mark.parametrize("rate_hz", [20, 100])
