@@ -21,7 +21,7 @@ from avtorch.io import Log
 from tests.gap.records import log_of
 from tests.overridden import deleted
 
-OVERRIDES = ((12.0, 15.0), (22.5, 22.6), (31.0, 36.2))
+OVERRIDES = ((14.0, 17.0), (22.5, 22.6), (31.0, 36.2))
 
 
 def _driven(log: Log) -> Log:
