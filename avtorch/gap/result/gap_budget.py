@@ -14,15 +14,15 @@ size at which that is the cost of an effect's presence is the least that shows.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from avtorch.arrays import FloatArray, IntArray
+from avtorch.arrays import FloatArray
 from avtorch.gap.engine.average import ModelAverage
-from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name
+from avtorch.gap.engine.coordinates import EFFECTS, base_name
 from avtorch.gap.engine.family import FAMILIES, FORMS, OWN, family_of
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
@@ -41,7 +41,15 @@ from avtorch.gap.result.budget import (
 )
 from avtorch.gap.result.free_form import FittedForm
 from avtorch.gap.result.held_out import Blocks, HeldOut
-from avtorch.gap.result.hypotheses import AnswerPart, aliases_of, implausible, map_size, onset_of, part_probability
+from avtorch.gap.result.hypotheses import (
+    AnswerPart,
+    aliases_of,
+    drawn_squares,
+    implausible,
+    map_size,
+    onset_of,
+    part_probability,
+)
 from avtorch.gap.result.parameters import ParameterPosterior
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
@@ -49,7 +57,7 @@ RESAMPLES = 400
 """Of blocks, with replacement."""
 _NOTHING = 1e-3  # of the energy before, below which free runs show no gap
 _NO_GAP = 0.1  # share of the error before that is within the floor: nothing to close
-_DRAWS = 48  # of parameters, for the size of a family
+_DENSITY = "log_predictive_density"
 
 
 @dataclass(frozen=True)
@@ -143,7 +151,8 @@ def budget_of(
     beyond = float((rest > material).mean()) if parts else 0.0
     matters = beyond > 0.95 if parts else tuple(names) == ("unknown",)
     if not parts and names[0] not in ("none", "unknown"):  # chance alone is named, and no part of a simulator is
-        matters = held.free and _surely_takes_off(energy, seed) > material
+        before, named, last = resampled(energy[[0, -2, -1]], seed)
+        matters = held.free and float(np.quantile((named - last) / before, 0.05)) > material
     most = max(sum(p.share.mean for p in parts), 1.0)  # an effect without a name may cost instead of taking off
     parts = [replace(p, share=p.share.scaled(1 / most)) for p in parts]
     carried = shares.get("free form")
@@ -171,25 +180,20 @@ def budget_of(
 def shrinkage_of(held: HeldOut, seed: int = 0) -> Shrinkage:
     """How far the gap shrinks on held-out blocks with all causes, by measure."""
     four = (held.steps[0], held.steps[-1], held.floor, held.ceiling)
-    framed = np.flatnonzero(held.frame_rows)  # a block between two frames has no density
-    measures = {f"rollout_rmse_{name}": [x.squares[c] for x in four] for c, name in enumerate(held.data.channels)}
-    measures["log_predictive_density"] = [x.nats[framed] for x in four]
+    sizes, framed = held.blocks.sizes, np.flatnonzero(held.frame_rows)  # a block between two frames has no density
     out: dict[str, MetricShrinkage] = {}
     ceiling: dict[str, float] = {}
-    for name, each in measures.items():
-        density = name == "log_predictive_density"
-        sums, rows = np.stack(each), held.frame_rows[framed] if density else held.blocks.sizes
-        pick = np.random.default_rng(seed).integers(0, len(rows), (RESAMPLES, len(rows)))
-        levels, drawn = sums.sum(1) / rows.sum(), sums[:, pick].sum(-1) / rows[pick].sum(-1)
-        if not density:
-            levels, drawn = np.sqrt(levels), np.sqrt(drawn)
-        out[name] = _metric(levels, drawn, None if density else held.horizon_s, density=density)
-        ceiling[name] = float(levels[3])
+    for c, channel in enumerate(held.data.channels):
+        name = f"rollout_rmse_{channel}"
+        levels = np.sqrt(resampled(np.stack([x.squares[c] for x in four]), seed) / resampled(sizes, seed))
+        out[name], ceiling[name] = _metric(levels, held.horizon_s, _NO_GAP), float(levels[3, 0])
     # the measure in which the gap shows most
-    rollouts = [name for name in measures if name != "log_predictive_density"]
-    top = max(rollouts, key=lambda k: out[k].before / max(out[k].floor, 1e-12))
-    if all(out[name].closed is None for name in rollouts):
-        top = "log_predictive_density"
+    top = max(out, key=lambda k: out[k].before / max(out[k].floor, 1e-12))
+    if all(x.closed is None for x in out.values()):
+        top = _DENSITY
+    nats = np.stack([x.nats[framed] for x in four])
+    levels = resampled(nats, seed) / resampled(held.frame_rows[framed], seed)
+    out[_DENSITY], ceiling[_DENSITY] = _metric(levels, None, 1e-3, better=np.maximum), float(levels[3, 0])
     return Shrinkage(top, out, ceiling, len(held.blocks.rows), held.blocks.by_drives)
 
 
@@ -277,22 +281,13 @@ def _levels(held: HeldOut) -> list[ChannelError]:
 
 def _shares(energy: FloatArray, floor: FloatArray, seed: int) -> FloatArray:
     """Shares (draw, part and rest) of the gap under resampled blocks; the first draw is of the blocks themselves."""
-    pick = resamples(energy.shape[1], np.random.default_rng(seed))
-    levels = np.moveaxis(energy[:, pick].mean(-1), 0, 1)  # draw, model
-    bottom = np.minimum(floor[pick].mean(-1), levels[:, -1])
+    levels = resampled(energy, seed).T  # draw, model
+    bottom = np.minimum(resampled(floor, seed), levels[:, -1])
     parts = np.column_stack([np.maximum(-np.diff(levels, axis=1), 0.0), levels[:, -1] - bottom])
     total = parts.sum(1, keepdims=True)
     alike = np.full_like(parts, 1.0 / max(parts.shape[1] - 1, 1))  # where runs show no gap, shares say nothing
     alike[:, -1] = 0.0 if parts.shape[1] > 1 else 1.0
     return np.where(total > _NOTHING * levels[:, :1], parts / np.maximum(total, 1e-300), alike)
-
-
-def _surely_takes_off(energy: FloatArray, seed: int) -> float:
-    """The lower end of what the last step takes off, in shares of the error before, under resampled blocks."""
-    blocks = energy.shape[1]
-    pick = np.random.default_rng(seed).integers(0, blocks, (RESAMPLES, blocks))
-    before, named, last = (energy[k][pick].mean(1) for k in (0, -2, -1))
-    return float(np.quantile((named - last) / before, 0.05))
 
 
 def _still(held: HeldOut, seed: int) -> Quantity:
@@ -303,37 +298,36 @@ def _still(held: HeldOut, seed: int) -> Quantity:
     """
     plant, box = held.steps[-1].squares[-1], held.rival.squares[-1]
     named = held.steps[len(held.chain) - 1].squares[-1]
-    possible = held.possible[:, -1]
-    rng = np.random.default_rng(seed)
-    pick = resamples(len(plant), rng)
-    total = np.maximum(plant[pick].sum(1), 1e-12)
-    did = np.clip((plant - box)[pick].sum(1) / total, 0.0, 1.0)
-    drawn = np.take_along_axis(possible[rng.integers(0, len(possible), RESAMPLES)], pick, 1).sum(1)
-    could = np.clip((drawn - np.maximum((named - plant)[pick].sum(1), 0.0)) / total, 0.0, 1.0)
+    total = np.maximum(resampled(plant, seed), 1e-12)
+    did = np.clip(resampled(plant - box, seed) / total, 0.0, 1.0)
+    of_draw = np.random.default_rng(seed).integers(0, len(held.possible), RESAMPLES)
+    possible = resampled(held.possible[:, -1], seed)[of_draw, np.arange(RESAMPLES)]
+    could = np.clip((possible - np.maximum(resampled(named - plant, seed), 0.0)) / total, 0.0, 1.0)
     low, high = float(np.quantile(did, 0.05)), float(np.quantile(np.maximum(did, could), 0.95))
     mean = float(did[0])
     return Quantity(mean, float(did.std()), min(low, mean), max(high, mean))
 
 
-def resamples(blocks: int, rng: np.random.Generator) -> IntArray:
-    """Numbers (draw, block) of resampled blocks; the first draw is the blocks themselves."""
-    pick = rng.integers(0, blocks, (RESAMPLES, blocks))
+def resampled(x: FloatArray, seed: int) -> FloatArray:
+    """Means (..., draw) over resampled blocks of `x` (..., block); the first draw is the blocks themselves."""
+    blocks = x.shape[-1]
+    pick = np.random.default_rng(seed).integers(0, blocks, (RESAMPLES, blocks))
     pick[0] = np.arange(blocks)
-    return pick
+    return x[..., pick].mean(-1)
 
 
-def _metric(levels: FloatArray, drawn: FloatArray, horizon: float | None, *, density: bool = False) -> MetricShrinkage:
-    """Before, after and floor of one measure; `drawn` (level, draw) under resampled blocks."""
-    before, after, floor, _ = levels
-    floor = max(floor, after) if density else min(floor, after)
-    nothing = abs(before - floor) < (1e-3 if density else _NO_GAP * before)
-    closed = None
-    if not nothing:
-        bottom = np.maximum(drawn[2], drawn[1]) if density else np.minimum(drawn[2], drawn[1])
-        shares = (drawn[0] - drawn[1]) / np.where(drawn[0] == bottom, np.inf, drawn[0] - bottom)
-        value = (before - after) / (before - floor)
-        closed = Quantity.of_resampled(value, shares)
-    return MetricShrinkage(float(before), float(after), float(floor), closed, horizon)
+def _metric(
+    levels: FloatArray, horizon: float | None, nothing: float, better: Callable[..., Any] = np.minimum
+) -> MetricShrinkage:
+    """Of `levels` (before, after, floor and ceiling; draw) under resampled blocks; `nothing`: of a gap, relative to an
+    error, or of a density [nats]."""
+    before, after = levels[:2]
+    bottom = better(levels[2], after)
+    gap, closed = before - bottom, None
+    if abs(gap[0]) >= nothing * (before[0] if better is np.minimum else 1.0):
+        shares = (before - after) / np.where(gap == 0, np.inf, gap)
+        closed = Quantity.of_resampled(shares[0], shares)
+    return MetricShrinkage(float(before[0]), float(after[0]), float(bottom[0]), closed, horizon)
 
 
 def _share_of_noise(posterior: ParameterPosterior, name: str) -> float | None:
@@ -369,45 +363,18 @@ def _size(
     """Root mean square [m/s²] of what the parts of a family do together; of a random cause by its own size."""
     h, names = posterior.hypothesis, [part.name for part in own]
     effects = [e for e in h.effects if base_name(e) in names and EFFECTS[e].coordinates]
-    rng = np.random.default_rng(seed)
-    total = np.zeros(_DRAWS)
-    if effects:
-        total += _drawn_squares(posterior, effects, blocks, rng)
+    total = drawn_squares(posterior, effects, blocks.rows, seed) if effects else np.zeros(1)
     if any(part.name is None and part.form not in FORMS for part in own) and h.force is not None:
         if not effects:
             return map_size(h, seed)
-        total += map_size(h, seed).mean ** 2
+        total = total + map_size(h, seed).mean ** 2
     elif free is not None:
-        adds = free.without([])
-        total += _block_squares(blocks, np.interp(h.data.time, h.data.grid.time, adds)[None], rng)
+        adds = np.interp(h.data.time, h.data.grid.time, free.without([]))
+        squares = np.array([(adds[rows] ** 2).mean() for rows in blocks.rows])
+        total = total + resampled(squares, seed)[: None if len(total) == 1 else len(total)]
     if total.any():
         return Quantity.of_draws(np.sqrt(total))
     return next((part.size_mps2 for part in own if part.size_mps2 is not None), None)
-
-
-def _drawn_squares(
-    posterior: ParameterPosterior, effects: Sequence[str], blocks: Blocks, rng: np.random.Generator
-) -> FloatArray:
-    h, draws = posterior.hypothesis, posterior.draws
-    x = draws.x.reshape(-1, len(draws.names))
-    at = [INDEX[name] for name in draws.names]
-    own = [INDEX[c.name] for e in effects for c in EFFECTS[e].coordinates]
-    out = np.empty(_DRAWS)
-    for k, i in enumerate(np.linspace(0, len(x) - 1, _DRAWS).astype(int)):
-        values = h.values.copy()
-        values[at] = x[i]
-        without = values.copy()
-        without[own] = h.neutral[own]
-        does = np.stack(h.rows(values)) - np.stack(h.rows(without))
-        out[k] = _block_squares(blocks, does, rng, 1)[0]
-    return out
-
-
-def _block_squares(blocks: Blocks, does: FloatArray, rng: np.random.Generator, count: int = _DRAWS) -> FloatArray:
-    """Mean squares (draw,) of rows (channel, row) over resampled blocks, of the channel that shows it most."""
-    squares = np.stack([(does[:, rows] ** 2).mean(1) for rows in blocks.rows], 1)
-    pick = rng.integers(0, len(blocks.rows), (count, len(blocks.rows)))
-    return squares[:, pick].mean(-1).max(0)
 
 
 def _takes_off(held: HeldOut, family: str, seed: int) -> Quantity | None:
@@ -418,7 +385,6 @@ def _takes_off(held: HeldOut, family: str, seed: int) -> Quantity | None:
     before, after, floor = (x.squares for x in (held.steps[0], held.steps[-1], held.floor))
     scale = np.maximum(np.minimum(floor, after).mean(1), 1e-12)[:, None]
     before, after, less, floor = ((x / scale).mean(0) for x in (before, after, without.squares, floor))
-    pick = resamples(len(after), np.random.default_rng(seed))
-    whole = np.maximum((before - np.minimum(floor, after))[pick].mean(1), 1e-9)
-    draws = np.clip((less - after)[pick].mean(1) / whole, 0.0, 1.0)
+    whole = np.maximum(resampled(before - np.minimum(floor, after), seed), 1e-9)
+    draws = np.clip(resampled(less - after, seed) / whole, 0.0, 1.0)
     return Quantity.of_resampled(draws[0], draws)

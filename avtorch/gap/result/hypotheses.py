@@ -19,7 +19,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.average import ModelAverage, Weight, free_form_response
-from avtorch.gap.engine.coordinates import EFFECTS, base_name
+from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name
 from avtorch.gap.engine.family import FORMS, family_of
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.outliers import rate_onset
@@ -38,6 +38,7 @@ LEAST_LISTED = 1e-4
 ALIAS_RATIO = 0.03
 """Hypotheses at least this probable, relative to the most probable one, are not distinguished from it."""
 _DRAWS = 400  # of a map's coefficients
+_SIZES = 48  # draws of the size of an effect
 _HELD = 0.9  # probability that an alias set holds
 _MOST_ALIASES = 6
 
@@ -463,17 +464,25 @@ def _size(posterior: ParameterPosterior, name: str) -> Quantity | None:
     effect = next((e for e in h.effects if base_name(e) == name), None)
     if effect is None:
         return None
-    does = [a - b for a, b in zip(h.rows(), h.without(effect).rows(), strict=True)]
-    size = max(float(np.sqrt((x**2).mean())) for x in does)
-    return Quantity.of_draws(size * _relative(posterior, effect))
+    return Quantity.of_draws(np.sqrt(drawn_squares(posterior, [effect], [slice(None)])))
 
 
-def _relative(posterior: ParameterPosterior, effect: str) -> FloatArray:
-    """Draws (draw,) of the size of an effect's first coordinate over that of the fit."""
-    h, coordinates = posterior.hypothesis, EFFECTS[effect].coordinates
-    if not coordinates:
-        return np.ones(1)
-    first = coordinates[0]
-    neutral = h.without(effect)[first.name]
-    at = h[first.name] - neutral
-    return np.abs(posterior.draws[first.name].reshape(-1) - neutral) / max(abs(at), 1e-12)
+def drawn_squares(
+    posterior: ParameterPosterior, effects: Sequence[str], parts: Sequence[slice], seed: int = 0
+) -> FloatArray:
+    """Mean squares (draw,) [(m/s²)²] of what effects do, in the channel that shows it most: at draws of the posterior,
+    each over resampled `parts` of the rows."""
+    h, draws = posterior.hypothesis, posterior.draws
+    x = draws.x.reshape(-1, len(draws.names))
+    at = [INDEX[name] for name in draws.names]
+    own = [INDEX[c.name] for e in effects for c in EFFECTS[e].coordinates]
+    rng, out = np.random.default_rng(seed), np.empty(_SIZES)
+    for k, i in enumerate(np.linspace(0, len(x) - 1, _SIZES).astype(int)):
+        values = h.values.copy()
+        values[at] = x[i]
+        without = values.copy()
+        without[own] = h.neutral[own]
+        does = np.stack(h.rows(values)) - np.stack(h.rows(without))
+        squares = np.stack([(does[:, rows] ** 2).mean(1) for rows in parts], 1)
+        out[k] = squares[:, rng.integers(0, len(parts), len(parts))].mean(1).max()
+    return out

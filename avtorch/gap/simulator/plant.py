@@ -25,7 +25,6 @@ from avtorch.gap.simulator.force_table import FREE_FORMS
 from avtorch.gap.simulator.parameter import Domain, Parameter
 from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
 from avtorch.io.opening import parse_toml, place, read_toml
-from avtorch.numeral import numeral
 from avtorch.vehicle.arguments import Number, checked, tensor
 from avtorch.vehicle.plant import Motion
 
@@ -47,8 +46,6 @@ _DOMAINS = {
     "sigma": Domain("sigma", 0.0, 1e3, "m/s³"),
 }
 """Valid values of the baseline's parameters in a text."""
-
-_LONGEST = 10_000  # most characters of a plant as a short string
 
 
 class GapPlant:
@@ -248,37 +245,17 @@ def _parsed(text: str, more: Iterable[type[Effect]] = ()) -> GapPlant:
     """A plant from TOML or a short string; `"glvd"` or nothing is bare GLVD. Raises `InputError` for errors in the
     text.
 
-    In a short string an effect's name sets its first parameter, `effect.parameter` any, and an effect without a value
-    has its typical ones.
+    A short string is a line of TOML for each of its commas. In it an effect's name sets its first parameter,
+    `effect.parameter` any, and an effect without a value has its typical ones.
     """
     if "\n" in text or "[" in text:
         return _of(parse_toml(text, "plant"), more)
-    if len(text) > _LONGEST:
-        raise InputError(f"plant: found {len(text):,} characters, needs {_LONGEST:,} at most, or a TOML file")
-    tables: dict[str, Any] = {}
-    for item in filter(None, (x.strip() for x in text.split(","))):
-        key, equals, value = (x.strip() for x in item.partition("="))
-        if key.lower() == "glvd" and not equals:
-            continue
-        name, dot, parameter = key.partition(".")
-        if not equals:
-            known = effect_class(name, more).name if not dot else name
-            if known in tables or dot:
-                raise InputError(f"plant: found {quoted(item)}, needs an effect's name, once, or NAME=NUMBER")
-            tables[known] = {}
-            continue
-        try:
-            number = numeral(value)
-        except ValueError:
-            raise InputError(f"plant: found {quoted(item)}, needs a number after '='") from None
-        if key in _DOMAINS:
-            table, parameter = tables, key
-        else:
-            first = _first(effect_class(name, more))
-            table, parameter = tables.setdefault(name, {}), parameter if dot else first
-        if parameter in table:
-            raise InputError(f"plant: found {quoted(item)} besides another value, needs one")
-        table[parameter] = number
+    items = [item for x in text.split(",") if (item := x.strip()).lower() not in ("", "glvd")]
+    lines = [item if "=" in item else f"{item} = {{}}" for item in items]
+    try:
+        tables = parse_toml("\n".join(lines), "plant")
+    except InputError:
+        raise InputError(f"plant: found {quoted(text)}, needs effects, each once, such as dead_time=0.2") from None
     return _of(tables, more)
 
 
