@@ -6,8 +6,7 @@ estimator of White 1982), and is never less than the posterior's. Differences th
 manoeuvres therefore count as spread, not as a change.
 
 The cause: T_L alone, K_L alone, dead time, or an effect of the table, whichever explains the drives after best in one
-model of both sides that shares all the rest (`engine.joint`). Where `T_L` or `K_L` differ, the same model tells a
-change of dead time, which resembles a longer lag, from one of lag and gain.
+model of both sides that shares all the rest (`engine.joint`).
 
 The simulator: errors of free runs over both sets, and their ratio over bootstrapped runs.
 """
@@ -31,8 +30,8 @@ from avtorch.gap.engine.joint import JointModel, block_scores
 from avtorch.gap.engine.priors import ONE_CHANNEL_HZ
 from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.cause_of_change import cause_of_change, dead_time_test
-from avtorch.gap.result.comparison import Change, ChangeCause, Comparison, DeadTimeTest, SimulatorChange
+from avtorch.gap.result.cause_of_change import cause_of_change
+from avtorch.gap.result.comparison import Change, ChangeCause, Comparison, SimulatorChange
 from avtorch.gap.result.counted_rows import HORIZON_S, CountedRows, runs_over
 from avtorch.gap.result.diagnosis import BlackBoxSimulator
 from avtorch.gap.result.log_facts import LogFacts
@@ -134,16 +133,15 @@ def compare(
     gap = _gaps(fitted, simulators, horizon, runs, same=same)
     simulator = _simulator_change(gap)
     changed = p_value < level
-    cause, of_two = None, None
+    cause = None
     if told is not None:
         told("one model of both drives", 1, 2)
     try:
         model = None if same else JointModel.of(DriveData.of([*sides[0], *sides[1]]), len(sides[0]), plants[0])
-    except InputError:  # long enough for lag and gain, too short for a cause
+    except InputError:  # other rates, or kinds of accelerometer
         model = None
     if model is not None:
         cause = cause_of_change(model, kinds, progress=told)
-        of_two = dead_time_test(model) if changed else None
     return Comparison(
         before=facts[0],
         after=facts[1],
@@ -152,10 +150,7 @@ def compare(
         p_value=p_value,
         changed=changed,
         simulator=simulator,
-        why=_sentence(
-            car, p_value, simulator, changed, of_two, cause, same=same, simulators=1 + (given[0] is not given[1])
-        ),
-        dead_time_test=of_two,
+        why=_sentence(car, p_value, simulator, changed, cause, same=same, simulators=1 + (given[0] is not given[1])),
         cause=cause,
         horizon_s=horizon,
     )
@@ -258,7 +253,6 @@ def _sentence(
     p_value: float,
     simulator: SimulatorChange,
     changed: bool,
-    of_two: DeadTimeTest | None,
     cause: ChangeCause | None,
     *,
     same: bool,
@@ -273,39 +267,11 @@ def _sentence(
         f"{name} {car[name].before.mean:.2f} to {car[name].after.mean:.2f}{unit}"
         for name, unit in (("T_L", " s"), ("K_L", ""))
     )
-    # what all effects were tried for is not said again of two of them
-    named = cause is not None and bool(cause.parts)
-    first = _explanation(numbers, f"p = {p_value:.2g}", changed, of_two, named=named)
+    first = "The car has changed: as GLVD without any effect," if changed else "T_L and K_L alone show no change:"
     words = {
         "closer": "the drives after are closer to the simulator",
         "farther": "the drives after are farther from the simulator",
         "inconclusive": "the simulator's error has not changed measurably",
     }
-    last = (
-        "The drives, or the stretches between overrides, are too short to name a cause." if cause is None else cause.why
-    )
-    return f"{first}; {words[simulator]}. {last}"
-
-
-def _explanation(numbers: str, chance: str, changed: bool, of_two: DeadTimeTest | None, *, named: bool) -> str:
-    """The sentence on lag and gain: they are stated as the explanation only where dead time is none."""
-    if not changed:
-        first = "T_L and K_L alone show no change" if named else "No change of the car is detected"
-        return f"{first}: {numbers} ({chance})"
-    if named:
-        return f"The car has changed: as GLVD without any effect, {numbers} ({chance})"
-    if of_two is None:
-        return f"The car has changed: {numbers} ({chance})"
-    delays = " to ".join(f"{max(q.mean, 0.0):.2f}" for q in (of_two.before, of_two.after))
-    if of_two.explanation == "lag and gain":
-        more = f"that the dead time has changed instead or too has probability {1 - of_two.p_lag_gain:.2g}"
-        return f"The car has changed: {numbers} ({chance}); {more}"
-    if of_two.explanation == "not distinguishable":
-        return (
-            f"The car has changed ({chance}), but these drives cannot distinguish a change of lag and gain ({numbers}) "
-            f"from one of dead time ({delays} s, probability {1 - of_two.p_lag_gain:.2g})"
-        )
-    return (
-        f"The car has changed ({chance}), but lag and gain do not explain it (probability {of_two.p_lag_gain:.2g}): "
-        f"a dead time fitted as well goes from {delays} s, and without one they would be {numbers}"
-    )
+    last = "The drives are too unlike to name a cause." if cause is None else cause.why
+    return f"{first} {numbers} (p = {p_value:.2g}); {words[simulator]}. {last}"

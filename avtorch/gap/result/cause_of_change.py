@@ -14,7 +14,6 @@ from avtorch.gap.engine.changes import (
     ChangePosterior,
     Progress,
     candidates,
-    lag_or_dead_time,
     scatter_of,
     search_changes,
 )
@@ -23,7 +22,7 @@ from avtorch.gap.engine.hypothesis import Hypothesis, table_effect
 from avtorch.gap.engine.joint import Change, JointFit, JointModel, of_car
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.budget import LIKELY
-from avtorch.gap.result.comparison import Answer, ChangeCause, ChangePart, DeadTimeTest, detectable_text
+from avtorch.gap.result.comparison import Answer, ChangeCause, ChangePart, detectable_text
 from avtorch.gap.simulator.effect import Effect
 
 _ERRORS = 4.0  # 2.6 standard errors are as likely as not, and 1.4 more have them in nine of ten drives
@@ -56,18 +55,6 @@ def cause_of_change(
     return ChangeCause(parts, answer, detectable, _why(found, parts, answer, detectable))
 
 
-def dead_time_test(model: JointModel) -> DeadTimeTest | None:
-    """Whether lag and gain, or the dead time, explain a change; None where the dead time is the baseline's own."""
-    if "dead_time" not in model.base.effects:
-        return None
-    fit, same_delay, same_car = lag_or_dead_time(model)
-    sure = _sure(model)
-    sd = math.sqrt(scatter_of(model, fit, fit.changes[-1]).variance)
-    before, after = (h["dead_time"] for h in fit.sides)
-    each = [Quantity(x, sd, x - sure * sd, x + sure * sd) for x in (before, after, after - before)]
-    return DeadTimeTest(*each, p_lag_gain=same_delay, p_dead_time=same_car)
-
-
 def _would_enter(found: ChangePosterior) -> bool:
     """Whether the change that was rejected had entered if halves and blocks agreed."""
     return found.rejected is not None and found.rejected[2] > 0
@@ -84,17 +71,13 @@ def _part(found: ChangePosterior, change: Change) -> ChangePart:
     )
 
 
-def _sure(model: JointModel) -> float:
-    """Half the central 90 % of Student's t, in standard deviations, by the blocks of the shorter side."""
-    return float(student.ppf(0.95, model.blocks - 1))
-
-
 def _parameters(found: ChangePosterior, change: Change) -> dict[str, Quantity]:
     """By blocks of both sides, and by what comes and goes between the halves of one."""
     fit, model = found.best.fit, found.model
     likelihood, blocks, drift = model.covariance(fit)
     blocks = blocks + 1e-9 * np.diag(np.diag(likelihood))  # also of what stands at a limit
-    at, sure = fit.at(change), _sure(model)
+    at = fit.at(change)
+    sure = float(student.ppf(0.95, model.blocks - 1))  # blocks of the shorter side
     spread = blocks * np.sqrt(np.outer(*2 * [np.maximum(np.diag(likelihood) / np.diag(blocks), 1.0)]))
     spread[at, at] += drift[at]
     here = _reported(model, fit, change, fit.x)

@@ -16,9 +16,6 @@ if TYPE_CHECKING:
 
 Answer = Literal["named", "ambiguous", "unknown", "drift", "none"]
 SimulatorChange = Literal["closer", "farther", "inconclusive"]
-Explanation = Literal["lag and gain", "not lag and gain", "not distinguishable"]
-
-_SURE = 0.75  # three to one: the probability from which on an explanation stands
 
 
 @dataclass(frozen=True)
@@ -90,35 +87,6 @@ class Change:
     ratio: Quantity
 
 
-@dataclass(frozen=True)
-class DeadTimeTest:
-    """Whether lag and gain explain a change better than a change of dead time, by one model of both sets of drives.
-
-    Dead time [s] `before`, `after` and their `difference`, where lag and gain may have changed as well. `p_lag_gain`:
-    probability that lag or gain has changed and the dead time has not; `p_dead_time`: that the dead time alone has;
-    the rest: both have.
-    """
-
-    before: Quantity
-    after: Quantity
-    difference: Quantity
-    p_lag_gain: float
-    p_dead_time: float
-
-    @property
-    def explanation(self) -> Explanation:
-        """`"lag and gain"` where they alone have changed with a probability of 0.75, `"not lag and gain"` where they
-        have not, `"not distinguishable"` otherwise."""
-        if self.p_lag_gain < 1 - _SURE:
-            return "not lag and gain"
-        return "lag and gain" if self.p_lag_gain > _SURE else "not distinguishable"
-
-    def to_dict(self) -> dict[str, Any]:
-        out = of_fields(self)
-        delays = {key: out.pop(key) for key in ("before", "after", "difference")}
-        return {"explanation": self.explanation, "dead_time_s": delays} | out
-
-
 @dataclass(frozen=True, repr=False)
 class Comparison(Displayed):
     """`car`: `T_L` [s] and `K_L` fitted to each set of drives; `gap`: rollout errors of the simulator, by metric, over
@@ -126,9 +94,8 @@ class Comparison(Displayed):
 
     `changed`: the car's parameters differ, with p-value `p_value` for drives of one car. `simulator`: whether the
     simulator's errors on the drives after are smaller than those on the drives before (each with its own simulator,
-    where two are given); `"inconclusive"`: neither. `dead_time_test`: where the car has changed, whether lag and gain
-    explain it; else None. `cause`: what of T_L, K_L, dead time and all effects differs; None where both sides are one
-    drive, or too short for it.
+    where two are given); `"inconclusive"`: neither. `cause`: what of T_L, K_L, dead time and all effects differs; None
+    where both sides are one drive, or differ in their rates.
     """
 
     before: LogFacts
@@ -139,7 +106,6 @@ class Comparison(Displayed):
     changed: bool
     simulator: SimulatorChange
     why: str
-    dead_time_test: DeadTimeTest | None = None
     cause: ChangeCause | None = None
     horizon_s: float = 10.0
 
@@ -166,8 +132,7 @@ class Comparison(Displayed):
 
     def to_dict(self) -> dict[str, Any]:
         """The object of `comparison.json`, schema `avtorch.comparison/1`."""
-        out = of_fields(self)
-        return {"schema": "avtorch.comparison/1", "explained": out.pop("dead_time_test")} | out
+        return {"schema": "avtorch.comparison/1"} | of_fields(self)
 
 
 def detectable_text(name: str, value: float) -> str:
