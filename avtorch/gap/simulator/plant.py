@@ -250,12 +250,17 @@ def _parsed(text: str, more: Iterable[type[Effect]] = ()) -> GapPlant:
     """
     if "\n" in text or "[" in text:
         return _of(parse_toml(text, "plant"), more)
-    items = [item for x in text.split(",") if (item := x.strip()).lower() not in ("", "glvd")]
-    lines = [item if "=" in item else f"{item} = {{}}" for item in items]
+    lines = []
+    for item in filter(None, map(str.strip, text.split(","))):
+        key, equals, value = (x.strip() for x in item.partition("="))
+        if equals and "." not in key and key not in _DOMAINS:
+            lines.append(f"{key}.{_first(effect_class(key, more))} = {value}")
+        elif equals or key.lower() != "glvd":
+            lines.append(item if equals else f"{item} = {{}}")
     try:
         tables = parse_toml("\n".join(lines), "plant")
     except InputError:
-        raise InputError(f"plant: found {quoted(text)}, needs effects, each once, such as dead_time=0.2") from None
+        raise InputError(f"plant: found {quoted(text)}, needs effects and numbers, each once, such as dead_time=0.2") from None
     return _of(tables, more)
 
 
