@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +52,7 @@ class GearShift(Effect):
     place = "actuator"
     needs_speed = True
     meaning = "upshifts at certain speeds interrupt the drive torque"
+    words = "upshifts interrupt the drive torque for {duration_s:.2g} s"
     equation = "K_L (1 - depth) for duration after each upshift, where u > 0"
     of_the_drive = True
     parameters = (
@@ -65,10 +65,6 @@ class GearShift(Effect):
         Domain("speeds", 0.1, 150.0, "m/s", most=16, rising=True),
         Domain("rearm_mps", 0.0, 20.0, "m/s"),
     )
-
-    @classmethod
-    def in_words(cls, values: Mapping[str, float]) -> str:
-        return f"upshifts interrupt the drive torque for {values['duration_s']:.2g} s"
 
     def start(self, x: Tensor, row: EffectContext) -> list[tuple[Tensor, Tensor, Tensor]]:
         """State of each shift: speed one row ago, whether above, start of the last interruption."""

@@ -264,10 +264,7 @@ def least_visible(h: Hypothesis, among: Sequence[str]) -> Mapping[str, tuple[flo
 # inside ---------------------------------------------------------------------------------------------------------------
 def _energies(held: HeldOut) -> tuple[FloatArray, FloatArray]:
     """Energies (model, block) of the chain and (block,) of the floor, each channel over its own floor."""
-    levels = np.stack([x.squares for x in held.steps])  # model, channel, block
-    # where a black box on top only harms, the model itself is the floor
-    worse = held.floor.squares.sum(1) > levels[-1].sum(1)
-    bottom = np.where(worse[:, None], levels[-1], held.floor.squares)
+    levels, bottom = np.stack([x.squares for x in held.steps]), held.floor.squares  # model, channel, block
     scale = np.maximum(bottom.mean(1), 1e-12)[:, None]
     return (levels / scale).mean(1), (bottom / scale).mean(0)
 
@@ -275,7 +272,6 @@ def _energies(held: HeldOut) -> tuple[FloatArray, FloatArray]:
 def _levels(held: HeldOut) -> list[ChannelError]:
     """Root mean squares before, at the floor and left, a channel."""
     three = np.stack([x.squares.sum(1) for x in (held.steps[0], held.floor, held.steps[-1])])
-    three[1] = np.minimum(three[1], three[2])
     return [ChannelError(*map(float, x)) for x in np.sqrt(three / held.blocks.sizes.sum()).T]
 
 
@@ -383,8 +379,8 @@ def _takes_off(held: HeldOut, family: str, seed: int) -> Quantity | None:
     if without is None:
         return None
     before, after, floor = (x.squares for x in (held.steps[0], held.steps[-1], held.floor))
-    scale = np.maximum(np.minimum(floor, after).mean(1), 1e-12)[:, None]
+    scale = np.maximum(floor.mean(1), 1e-12)[:, None]
     before, after, less, floor = ((x / scale).mean(0) for x in (before, after, without.squares, floor))
-    whole = np.maximum(resampled(before - np.minimum(floor, after), seed), 1e-9)
+    whole = np.maximum(resampled(before - floor, seed), 1e-9)
     draws = np.clip(resampled(less - after, seed) / whole, 0.0, 1.0)
     return Quantity.of_resampled(draws[0], draws)

@@ -172,16 +172,14 @@ class HeldOut:
     """A chain of nested hypotheses on blocks that taught neither their parameters nor their noise.
 
     `steps`: scores of each hypothesis of `chain`, then of the last one with the `free` form, if there is one; `rival`,
-    `ceiling`: of the last and the first hypothesis with a `BlackBox` on top; `floor`: the rival's, no
-    higher than the last step. `possible` (draw, channel, block): squares of free runs of what the black box may have
-    missed. `horizon_s` of the free runs. `apart`: of the last step without a family of causes, by its name, everything
-    else refitted.
+    `ceiling`: of the last and the first hypothesis with a `BlackBox` on top. `possible` (draw, channel, block): squares
+    of free runs of what the black box may have missed. `horizon_s` of the free runs. `apart`: of the last step without
+    a family of causes, by its name, everything else refitted.
     """
 
     chain: tuple[Hypothesis, ...]
     blocks: Blocks
     steps: tuple[Scores, ...]
-    floor: Scores
     rival: Scores
     ceiling: Scores
     possible: FloatArray = field(repr=False)
@@ -200,6 +198,14 @@ class HeldOut:
         entered = (next(base_name(e) for e in _sized(b) if e not in a.effects) for a, b in steps)
         return (*entered, *(["free form"] if self.free else []))
 
+    @property
+    def floor(self) -> Scores:
+        """The rival's, no higher than the last step in any channel."""
+        last = self.steps[-1]
+        less = (self.rival.squares.sum(1) < last.squares.sum(1))[:, None]
+        better = max(self.rival, last, key=lambda scores: scores.nats.sum())
+        return Scores(np.where(less, self.rival.squares, last.squares), better.nats)
+
     def free_gains(self, *, named: bool) -> bool:
         """Whether the free form lowers the errors of free runs, against the baseline and, where they are `named`,
         against names alone; its size was chosen by other ways of leaving out."""
@@ -211,7 +217,7 @@ class HeldOut:
         """The same chain without its free form."""
         if not self.free:
             return self
-        return replace(self, steps=self.steps[:-1], floor=self.rival, free=False, apart={})
+        return replace(self, steps=self.steps[:-1], free=False, apart={})
 
     @property
     def frame_rows(self) -> FloatArray:
@@ -245,7 +251,6 @@ def held_out_errors(
         chain=tuple(chain),
         blocks=blocks,
         steps=tuple(steps),
-        floor=rival if free is None else _lower(rival, steps[-1]),
         rival=rival,
         ceiling=ceiling,
         possible=found[0].possible,
@@ -406,12 +411,6 @@ def _with_form(free: FittedForm, h: Hypothesis, blocks: Blocks) -> Scores:
         adds = free.without([own for own, fold in zip(blocks.rows, blocks.fold, strict=True) if fold == k])
         rows.append(readings(h, accel + adds, gained + speed_gained(h.data.grid, adds)))
     return _Taught.of(h, rows, blocks).scores(blocks)
-
-
-def _lower(a: Scores, b: Scores) -> Scores:
-    """The better of two in each channel, and in nats."""
-    less = (b.squares.sum(1) < a.squares.sum(1))[:, None]
-    return Scores(np.where(less, b.squares, a.squares), b.nats if b.nats.sum() > a.nats.sum() else a.nats)
 
 
 # scores --------------------------------------------------------------------------------------------------------------

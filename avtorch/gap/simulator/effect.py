@@ -129,9 +129,9 @@ class Effect:
 
     `reading`: what a sensor's effect acts on. `gravity`: a body force that an accelerometer does not measure (see
     `SimulatorInput.specific_force`). `derived`: what `report` names in place of coordinates that are not reported,
-    with typical and possible ranges. `shift`: the parameter [s], if there is one, by which it delays commands and does
-    nothing else. `settings`: valid values in a text for fields that are not parameters; a field without a domain takes
-    any single finite number.
+    with typical and possible ranges. `words`: what it does to the car, as a clause with its parameters in braces.
+    `shift`: the parameter [s], if there is one, by which it delays commands and does nothing else. `settings`: valid
+    values in a text for fields that are not parameters; a field without a domain takes any single finite number.
 
     `own_onset`: the parameter [s] that is its onset; no other onset is tried. `of_the_drive`: its parameters belong to
     a drive and not to the car. `memory`, `random`: whether it has `advance` and `noise`, which need not be said.
@@ -154,6 +154,7 @@ class Effect:
     place: ClassVar[Place]
     meaning: ClassVar[str]
     equation: ClassVar[str]
+    words: ClassVar[str] = ""
     parameters: ClassVar[tuple[Parameter, ...]]
     settings: ClassVar[tuple[Domain, ...]] = ()
     order: ClassVar[int] = 0
@@ -221,11 +222,11 @@ class Effect:
 
     @classmethod
     def in_words(cls, values: Mapping[str, float]) -> str:
-        """What it does to the car, as a clause, at `values` of its parameters under the answer's names.
+        """What it does to the car, as a clause, at `values` of its parameters under the answer's names: its `words`.
 
         Empty for an effect that is called by its name.
         """
-        return ""
+        return cls.words.format_map(values)
 
     def coordinates(self) -> tuple[Parameter, ...]:
         """The parameters of a fit: `parameters`, unless settings of this instance affect them."""
@@ -381,7 +382,7 @@ def cause_words(name: str, values: Mapping[str, float]) -> str:
         ('the command acts after a delay', '')
     """
     kind = EFFECTS.get(name)
-    if kind is None or kind.in_words.__func__ is Effect.in_words.__func__:
+    if kind is None or (not kind.words and kind.in_words.__func__ is Effect.in_words.__func__):
         return ""
     needed = [p.name for p in (kind.derived or kind.parameters) if p.reported]
     if any(math.isnan(values.get(key, math.nan)) for key in needed):

@@ -260,7 +260,9 @@ def _parsed(text: str, more: Iterable[type[Effect]] = ()) -> GapPlant:
     try:
         tables = parse_toml("\n".join(lines), "plant")
     except InputError:
-        raise InputError(f"plant: found {quoted(text)}, needs effects and numbers, each once, such as dead_time=0.2") from None
+        raise InputError(
+            f"plant: found {quoted(text)}, needs effects, each once, with numbers, as dead_time=0.2"
+        ) from None
     return _of(tables, more)
 
 

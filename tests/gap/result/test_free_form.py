@@ -83,7 +83,7 @@ def test_a_free_form_that_loses_in_the_budgets_runs_is_not_handed_back(named: fl
     """Against names alone, and against the baseline; channels count alike, whatever their units."""
     scale = np.array([[4.0, 4.0], [0.01, 0.03]])  # (channel, block)
     steps = tuple(Scores(x * scale, np.zeros(2)) for x in (1.0, named, free))
-    held = HeldOut((), cast(Any, None), steps, steps[0], steps[1], steps[0], np.zeros(1), horizon_s=10.0, free=True)
+    held = HeldOut((), cast(Any, None), steps, steps[1], steps[0], np.zeros(1), horizon_s=10.0, free=True)
     assert held.free_gains(named=True) == gains
     assert [x.squares[0, 0] for x in held.without_free().steps] == [4.0, 4.0 * named]
     assert not held.without_free().free
