@@ -93,7 +93,7 @@ class Trial:
 
     def with_effect(self, car: GapPlant, name: str) -> GapPlant:
         """`car` with one more effect, of typical size."""
-        return plant([EFFECTS[name]], baseline=car).prepared(*self.rows.drives, fitted=[name])
+        return plant(plant([EFFECTS[name]]).prepared(*self.rows.drives).effects, baseline=car)
 
     def rollout(
         self, car: GapPlant, on: Collection[str], values: Mapping[str, float]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import math
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from os import PathLike
 from pathlib import Path
@@ -108,16 +108,12 @@ class GapPlant:
         effects = [e.replaced(own[e.name]) if own[e.name] else e for e in self.effects]
         return GapPlant(effects, **base, sigma=self.sigma, seed=self.seed)
 
-    def prepared(self, *drives: SimulatorInput, fitted: Collection[str] | None = None) -> GapPlant:
-        """The plant with the settings that effects take from a drive (mean speed, span, length of the road).
-
-        Several: parts of one drive, in order. `fitted`: names of the effects that take theirs from it; those of a given
-        simulator keep their own. Default: all.
-        """
+    def prepared(self, *drives: SimulatorInput) -> GapPlant:
+        """The plant with the settings that effects take from a drive (mean speed, length of the road), or from several
+        parts of one, in order."""
         flat = [_joined([getattr(d, name) for d in drives]) for name in ("speed", "position")]
         time = torch.cat([d.time for d in drives])
-        own = {e.name for e in self.effects} if fitted is None else set(fitted)
-        effects = [e.prepared(time, *flat) if e.name in own else e for e in self.effects]
+        effects = [e.prepared(time, *flat) for e in self.effects]
         return GapPlant(effects, T_L=self.T_L, K_L=self.K_L, sigma=self.sigma, seed=self.seed)
 
     def report(self) -> dict[str, dict[str, Tensor]]:
