@@ -12,7 +12,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.gap import EFFECTS, GapPlant, plant
+from avtorch.gap import EFFECTS, Effect, GapPlant, plant
 from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.result.traces import Traces
 from avtorch.io import Log
@@ -72,7 +72,7 @@ class Trial:
         """What can be moved, by the names of `GapPlant.parameters`."""
         out, values = {}, car.values()
         for key, p in car.parameters().items():
-            if p.reported and p.size == 1 and key in values and values[key].numel() == 1:
+            if p.reported and key in values and values[key].numel() == 1:
                 value = float(values[key])
                 ends = [p.low, p.high, value, 0.6 * value, 1.4 * value, *([] if p.neutral is None else [p.neutral])]
                 known = [x for x in ends if np.isfinite(x)]
@@ -87,7 +87,7 @@ class Trial:
             for name, kind in sorted(EFFECTS.items())
             if not (name in own or kind.random or (kind.needs_speed and "speed" not in channels))
             and not (kind.place == "sensor" and "accel" not in channels)
-            and all(p.size == 1 for p in kind().coordinates())  # a road's profile is fitted, not set
+            and kind.drawn is Effect.drawn  # a road's profile is fitted, not set
             and any(key.startswith(f"{name}.") for key in self.sizes(self.with_effect(self.car, name)))
         ]
 

@@ -175,7 +175,7 @@ class TorchPlant:
             zero = torch.zeros(1, dtype=torch.float64)
             return DrivelineOscillation(frequency, zero, 2 * np.pi * frequency * pole, zero + _FREE_DAMPING)
         effect = table_effect(self.hypothesis, name)
-        neutral = {p.name: p.neutral for p in effect.coordinates() if p.neutral is not None}
+        neutral = {p.name: p.neutral for p in effect.parameters if p.neutral is not None}
         neutral = {k: min(max(x, -_NO_LIMIT), _NO_LIMIT) for k, x in neutral.items()}
         own = {c.parameter: own_value(c, z[c.name])[..., None] for c in coordinates}
         if first and effect.name not in _FILLING and effect.own_onset is None:

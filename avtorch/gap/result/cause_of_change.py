@@ -103,14 +103,14 @@ def _reported(model: JointModel, fit: JointFit, change: Change, x: FloatArray) -
         return {f"before{unit}": a, f"after{unit}": b, f"change{unit}": b - a}
     if change.grows:
         old, new = _of_effect(before, change), _of_effect(after, change)
-        neutral = {q.name for q in table_effect(after, change.effect).coordinates() if q.neutral == 0.0}
+        neutral = {q.name for q in table_effect(after, change.effect).parameters if q.neutral == 0.0}
         return {key: value - old[key] if key in neutral else value for key, value in new.items() if key in old}
     return _of_effect(before if change.less else after, change)
 
 
 def _of_effect(h: Hypothesis, change: Change) -> dict[str, float]:
     effect = table_effect(h, change.effect)
-    own = {q.name: q for q in effect.coordinates()}
+    own = {q.name: q for q in effect.parameters}
     out = {}
     for key, value in effect.report(torch.tensor([h["T_L"]], dtype=torch.float64)).items():
         x, q = torch.as_tensor(value).reshape(-1), own.get(key)

@@ -167,7 +167,7 @@ class ParameterPosterior:
         out = {name: self._column(name)[::every][:count] for name in ("T_L", "K_L")}
         for e in self.effects:
             effect = self._drawn(e)
-            for p in effect.coordinates():
+            for p in effect.parameters:
                 value = getattr(effect, p.name, None)
                 if isinstance(value, torch.Tensor) and value.dim() == 1:
                     out[f"{effect.name}.{p.name}"] = value.numpy()[::every][:count]

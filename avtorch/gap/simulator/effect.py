@@ -72,7 +72,6 @@ class EffectContext:
     T_L: Tensor
     K_L: Tensor
     normal: Tensor | None = None
-    whole: bool = True
 
     @property
     def speed(self) -> Tensor:
@@ -96,7 +95,7 @@ def context_at(row: EffectContext, k: int) -> EffectContext:
         return None if x is None else x if x.dim() == 0 else x[..., 0 if x.shape[-1] == 1 else k]
 
     parts = (row.time, row.dt, row.measured_speed, row.travelled, row.T_L, row.K_L, row.normal)
-    return EffectContext(*(pick(x) for x in parts), whole=False)
+    return EffectContext(*(pick(x) for x in parts))
 
 
 @dataclass(frozen=True)
@@ -228,10 +227,6 @@ class Effect:
         """
         return cls.words.format_map(values)
 
-    def coordinates(self) -> tuple[Parameter, ...]:
-        """The parameters of a fit: `parameters`, unless settings of this instance affect them."""
-        return self.parameters
-
     def prepared(self, time: Tensor, speed: Tensor | None, position: Tensor | None) -> Self:
         """This effect with the settings taken from a drive (mean speed, span), each (time,)."""
         return self
@@ -246,11 +241,11 @@ class Effect:
 
     def report(self, T_L: Tensor) -> dict[str, Tensor]:
         """The parameters under the answer's names, given the plant's lag."""
-        return {p.name: tensor(getattr(self, p.name)) for p in self.coordinates() if p.reported}
+        return {p.name: tensor(getattr(self, p.name)) for p in self.parameters if p.reported}
 
     def values(self) -> dict[str, Tensor]:
         """The fit's coordinates by name, without those that are None."""
-        named = {p.name: getattr(self, p.name) for p in self.coordinates()}
+        named = {p.name: getattr(self, p.name) for p in self.parameters}
         return {name: tensor(value) for name, value in named.items() if value is not None}
 
     def replaced(self, values: Mapping[str, Any]) -> Self:

@@ -32,11 +32,10 @@ class Parameter:
     """`name` (the key in an answer), `unit`, `neutral` value (None: any, once the others are neutral), typical range.
 
     `constraint` is the link: `"real"` the value itself, `"positive"` its log, `"negative"` the log of its opposite,
-    `"unit"` (0 to 1) its logit.
-    `reported` False: a coordinate that is fitted but not part of the answer. `size`: 1, or the length of a
-    vector-valued coordinate, then on its last dimension. `of_onset`: identifiable only where an effect has an onset
-    during a drive, and held at its prior's centre elsewhere. `possible`: the physically possible range; an answer
-    entirely outside it is reported as implausible. Default: three times the typical range, on the link's scale.
+    `"unit"` (0 to 1) its logit. `reported` False: a coordinate that is fitted but not part of the answer. `of_onset`:
+    identifiable only where an effect has an onset during a drive, and held at its prior's centre elsewhere. `possible`:
+    the physically possible range; an answer entirely outside it is reported as implausible. Default: three times the
+    typical range, on the link's scale.
 
     Raises `InputError` for a range that is empty or outside the constraint.
 
@@ -57,7 +56,6 @@ class Parameter:
     high: float
     constraint: Constraint = "positive"
     reported: bool = True
-    size: int = 1
     of_onset: bool = False
     possible: tuple[float, float] | None = None
 
@@ -121,13 +119,11 @@ class Parameter:
 
     def typical(self) -> Tensor:
         """The prior's median."""
-        shape = () if self.size == 1 else (self.size,)
-        return self.constrain(torch.zeros(shape, dtype=torch.float64))
+        return self.constrain(torch.zeros((), dtype=torch.float64))
 
     def sample(self, *shape: int, generator: torch.Generator | None = None) -> Tensor:
-        """Draws from the prior, of the given shape (and the parameter's size last, where it has one)."""
-        full = shape if self.size == 1 else (*shape, self.size)
-        return self.constrain(torch.randn(full, generator=generator, dtype=torch.float64))
+        """Draws from the prior, of the given shape."""
+        return self.constrain(torch.randn(shape, generator=generator, dtype=torch.float64))
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,7 @@ class GapPlant:
     def parameters(self) -> dict[str, Parameter]:
         """The coordinates of a fit: `T_L`, `K_L`, and `effect.parameter` of each effect."""
         own = {p.name: p for p in BASELINE}
-        return own | {f"{e.name}.{p.name}": p for e in self.effects for p in e.coordinates()}
+        return own | {f"{e.name}.{p.name}": p for e in self.effects for p in e.parameters}
 
     def values(self) -> dict[str, Tensor]:
         """Their current values; those that are not set (a grade's profile) are left out."""

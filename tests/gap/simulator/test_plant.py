@@ -282,6 +282,5 @@ def test_settings_come_from_the_drive() -> None:
     time = torch.arange(200, dtype=D) * 0.5 + 40
     drive = SimulatorInput(time, torch.zeros_like(time), torch.full_like(time, 8.0))
     car = plant([gap.SpeedDependentLag, gap.RoadGrade]).prepared(drive)
-    known = car.parameters()
     assert car.effects[0] == gap.SpeedDependentLag(mean_speed=8.0)
-    assert known["road_grade.profile"].size == int(8 * 99.5 / gap.RoadGrade().knot_m) + 4
+    assert car.effects[1] == gap.RoadGrade(knots=int(8 * 99.5 / gap.RoadGrade().knot_m) + 4)

@@ -101,14 +101,14 @@ def test_draws_of_every_prior_come_back_from_text(cls: type[Effect], fresh_seed:
     """A thousand typical ranges are wide enough for whatever a fit finds: draws of the prior, and six of its SDs."""
     generator = torch.Generator().manual_seed(fresh_seed)
     for _ in range(20):
-        values = {p.name: p.sample(generator=generator) for p in cls().coordinates() if p.name != "change_s"}
+        values = {p.name: p.sample(generator=generator) for p in cls.parameters if p.name != "change_s"}
         car = plant([cls().replaced(values)])
         again = GapPlant.from_toml(car.to_toml())
         assert again.to_toml() == car.to_toml()
         for name, value in car.values().items():
             assert torch.equal(again.values()[name], value), name
     for z in (-6.0, 6.0):
-        values = {p.name: p.constrain(torch.full(p.typical().shape, z)) for p in cls().coordinates()}
+        values = {p.name: p.constrain(torch.full(p.typical().shape, z)) for p in cls.parameters}
         car = plant([cls().replaced({k: v.double() for k, v in values.items() if k != "change_s"})])
         assert GapPlant.from_toml(car.to_toml()).to_toml() == car.to_toml()
 
