@@ -30,8 +30,7 @@ from avtorch.gap.engine.joint import JointModel, block_scores
 from avtorch.gap.engine.priors import ONE_CHANNEL_HZ
 from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.cause_of_change import cause_of_change
-from avtorch.gap.result.comparison import Change, ChangeCause, Comparison, SimulatorChange
+from avtorch.gap.result.comparison import Change, ChangeCause, Comparison, SimulatorChange, cause_of_change
 from avtorch.gap.result.counted_rows import HORIZON_S, CountedRows, runs_over
 from avtorch.gap.result.diagnosis import BlackBoxSimulator
 from avtorch.gap.result.log_facts import LogFacts

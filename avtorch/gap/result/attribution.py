@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 from scipy.signal import lfilter
@@ -23,7 +24,6 @@ from avtorch.gap.engine.coordinates import base_name
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import EFFECT_NATS
-from avtorch.gap.result.budget import Axis, Location
 from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
@@ -34,6 +34,41 @@ PLAINLY = 0.6
 """Largest share of the rows since the onset that a part may cover."""
 RATE = 0.05
 """False-discovery rate."""
+
+
+Axis = Literal["time", "speed", "command", "frequency", "signal"]
+UNITS: dict[Axis, str] = {"time": "s", "speed": "m/s", "command": "m/s²", "frequency": "Hz", "signal": ""}
+
+
+@dataclass(frozen=True)
+class Location:
+    """A part of the gap: `begin` to `end` on an `axis`, with its `share` of the cause's contribution.
+
+    Times are on the log's own clock [s], the others [m/s, m/s², Hz]; on the axis `signal` both are `"actuation"` (the
+    car's motion differs) or `"sensing"` (the accelerometer's reading differs). `q_value`: the false-discovery rate at
+    which all parts with a q-value as small are named.
+    """
+
+    axis: Axis
+    begin: float | str
+    end: float | str
+    share: float
+    q_value: float
+
+    def words(self, epoch_s: float = 0.0) -> str:
+        """The part as a phrase; times count from `epoch_s`, the log's start on its own clock."""
+        if isinstance(self.begin, str) or isinstance(self.end, str):
+            return "in the car's motion" if self.begin == "actuation" else "in the accelerometer's reading"
+        if self.axis == "time":
+            return f"from {self.begin - epoch_s:.1f} to {self.end - epoch_s:.1f} s after the log's start"
+        at, unit = "frequencies" if self.axis == "frequency" else f"{self.axis}s", UNITS[self.axis]
+        ends = f"from {self.begin:.2g} to {self.end:.2g}" if self.begin else f"below {self.end:.2g}"
+        return f"at {at} {ends} {unit}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `where` in `diagnosis.json`."""
+        part = {"axis": self.axis, "from": self.begin, "to": self.end}
+        return part | {"share": self.share, "q_value": self.q_value}
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,9 +16,8 @@ from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.gap.quantity import Quantity, frame_of, plain, unit_of
 from avtorch.gap.result import sentences
-from avtorch.gap.result.budget import Budget, Location
+from avtorch.gap.result.budget import Budget, Location, Shrinkage
 from avtorch.gap.result.free_form import FreeForm
-from avtorch.gap.result.gap_budget import Shrinkage
 from avtorch.gap.result.gap_size import GapSize
 from avtorch.gap.result.hypotheses import AnswerPart, Candidate, Scope, Verdict, listed_candidates, plausibility
 from avtorch.gap.result.log_facts import LogFacts

@@ -26,13 +26,15 @@ from avtorch.gap.engine.outliers import rate_onset
 from avtorch.gap.engine.priors import TEMPER
 from avtorch.gap.engine.search import Search
 from avtorch.gap.quantity import Quantity, of_fields, unit_of
-from avtorch.gap.result.budget import LIKELY, Location
+from avtorch.gap.result.attribution import Location
 from avtorch.gap.result.parameters import OwnRandom, ParameterPosterior
 from avtorch.gap.simulator.effect import Effect, candidate_name, delay_effect
 from avtorch.gap.simulator.plant import BASELINE, GapPlant
 from avtorch.io.units import GRAVITY
 
 ALWAYS = ("none", "unknown")
+LIKELY = 0.5
+"""Probability from which a part is named."""
 LEAST_LISTED = 1e-4
 """Hypotheses less probable than this are left out of an answer; `none` and `unknown` never are."""
 ALIAS_RATIO = 0.03
