@@ -101,6 +101,21 @@ class Traces:
         out[k] = self.measured[k] - free_runs(self.measured[k] - simulated[k], self.runs, self.step)
         return out
 
+    def accelerations(self, over_s: float) -> tuple[FloatArray, ...]:
+        """Measured and simulated, `before` and `after`: (row,) [m/s²] each. Where none was measured, slopes of the
+        speeds about each row over `over_s` [s]; at the ends of a stretch those of the nearest row that has one."""
+        k = self.channels.index("accel") if "accel" in self.channels else None
+        each = (x[k or 0] for x in (self.measured, self.before, self.after))
+        return tuple(self._slope(x, over_s) if k is None else x for x in each)
+
+    def _slope(self, speed: FloatArray, over_s: float) -> FloatArray:
+        out, step = np.empty_like(speed), self.step
+        for rows in self.stretches:
+            width = min(max(2, 2 * round(over_s / step / 2)), len(rows) - 1)
+            slope = (speed[rows[width:]] - speed[rows[: len(rows) - width]]) / (max(width, 1) * step)
+            out[rows] = slope[np.clip(np.arange(len(rows)) - width // 2, 0, len(slope) - 1)]
+        return out
+
     def fit(self, simulated: FloatArray) -> FloatArray:
         """Fit [%] of `simulated` (channel, row), such as `before` or `after`, to what was measured: (channel,), a speed
         `begun_anew`.
