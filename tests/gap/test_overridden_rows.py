@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from avtorch.errors import InputError
 from avtorch.gap import DeadTime, plant
-from avtorch.gap.effects import SpeedDependentGain
+from avtorch.gap.effects.speed_dependent_gain import SpeedDependentGain
 from avtorch.gap.engine.coordinates import EFFECTS
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis

@@ -14,7 +14,6 @@ from typing import Literal
 
 import numpy as np
 
-import avtorch.gap.effects  # noqa: F401 - fills the table
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.priors import FAINT_OF_RANGE, SCALE_OF_RANGE
 from avtorch.gap.simulator.effect import EFFECTS as TABLE

@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from avtorch.arrays import FloatArray, IntArray
-from avtorch.gap.effects import DrivelineOscillation
+from avtorch.gap.effects.driveline_oscillation import DrivelineOscillation
 from avtorch.gap.engine.compiled_plant import _FREE_DAMPING
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, NEUTRAL, Coordinate, base_name
 from avtorch.gap.engine.drive_data import UNKNOWN_SPEED_MPS, DriveData, filtered
