@@ -22,7 +22,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.average import ModelAverage
-from avtorch.gap.engine.coordinates import EFFECTS, base_name
+from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name
 from avtorch.gap.engine.family import FAMILIES, FORMS, OWN, family_of
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
@@ -37,7 +37,6 @@ from avtorch.gap.result.hypotheses import (
     LIKELY,
     AnswerPart,
     aliases_of,
-    drawn_squares,
     implausible,
     map_size,
     onset_of,
@@ -56,6 +55,7 @@ RESAMPLES = 400
 """Of blocks, with replacement."""
 _NOTHING = 1e-3  # of the energy before, below which free runs show no gap
 _NO_GAP = 0.1  # share of the error before that is within the floor: nothing to close
+_SIZES = 48  # draws of the size of a family
 _DENSITY = "log_predictive_density"
 
 
@@ -427,8 +427,10 @@ def budget_of(
     beyond = float((rest > material).mean()) if parts else 0.0
     matters = beyond > 0.95 if parts else tuple(names) == ("unknown",)
     if not parts and names[0] not in ("none", "unknown"):  # chance alone is named, and no part of a simulator is
-        before, named, last = resampled(energy[[0, -2, -1]], seed)
-        matters = held.free and float(np.quantile((named - last) / before, 0.05)) > material
+        matters = False
+        if held.free:
+            before, named, last = resampled(energy[[0, -2, -1]], seed)
+            matters = float(np.quantile((named - last) / before, 0.05)) > material
     most = max(sum(p.share.mean for p in parts), 1.0)  # an effect without a name may cost instead of taking off
     parts = [replace(p, share=p.share.scaled(1 / most)) for p in parts]
     carried = shares.get("free form")
@@ -635,7 +637,7 @@ def _size(
     """Root mean square [m/s²] of what the parts of a family do together; of a random cause by its own size."""
     h, names = posterior.hypothesis, [part.name for part in own]
     effects = [e for e in h.effects if base_name(e) in names and EFFECTS[e].coordinates]
-    total = drawn_squares(posterior, effects, blocks.rows, seed) if effects else np.zeros(1)
+    total = _drawn_squares(posterior, effects, blocks.rows, seed) if effects else np.zeros(1)
     if any(part.name is None and part.form not in FORMS for part in own) and h.force is not None:
         if not effects:
             return map_size(h, seed)
@@ -647,6 +649,27 @@ def _size(
     if total.any():
         return Quantity.of_draws(np.sqrt(total))
     return next((part.size_mps2 for part in own if part.size_mps2 is not None), None)
+
+
+def _drawn_squares(
+    posterior: ParameterPosterior, effects: Sequence[str], parts: Sequence[slice], seed: int = 0
+) -> FloatArray:
+    """Mean squares (draw,) [(m/s²)²] of what effects do, in the channel that shows it most: at draws of the posterior,
+    each over resampled `parts` of the rows."""
+    h, draws = posterior.hypothesis, posterior.draws
+    x = draws.x.reshape(-1, len(draws.names))
+    at = [INDEX[name] for name in draws.names]
+    own = [INDEX[c.name] for e in effects for c in EFFECTS[e].coordinates]
+    rng, out = np.random.default_rng(seed), np.empty(_SIZES)
+    for k, i in enumerate(np.linspace(0, len(x) - 1, _SIZES).astype(int)):
+        values = h.values.copy()
+        values[at] = x[i]
+        without = values.copy()
+        without[own] = h.neutral[own]
+        does = np.stack(h.rows(values)) - np.stack(h.rows(without))
+        squares = np.stack([(does[:, rows] ** 2).mean(1) for rows in parts], 1)
+        out[k] = squares[:, rng.integers(0, len(parts), len(parts))].mean(1).max()
+    return out
 
 
 def _takes_off(held: HeldOut, family: str, seed: int) -> Quantity | None:

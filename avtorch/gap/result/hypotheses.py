@@ -40,7 +40,6 @@ LEAST_LISTED = 1e-4
 ALIAS_RATIO = 0.03
 """Hypotheses at least this probable, relative to the most probable one, are not distinguished from it."""
 _DRAWS = 400  # of a map's coefficients
-_SIZES = 48  # draws of the size of an effect
 _HELD = 0.9  # probability that an alias set holds
 _MOST_ALIASES = 6
 
@@ -466,25 +465,12 @@ def _size(posterior: ParameterPosterior, name: str) -> Quantity | None:
     effect = next((e for e in h.effects if base_name(e) == name), None)
     if effect is None:
         return None
-    return Quantity.of_draws(np.sqrt(drawn_squares(posterior, [effect], [slice(None)])))
-
-
-def drawn_squares(
-    posterior: ParameterPosterior, effects: Sequence[str], parts: Sequence[slice], seed: int = 0
-) -> FloatArray:
-    """Mean squares (draw,) [(m/s²)²] of what effects do, in the channel that shows it most: at draws of the posterior,
-    each over resampled `parts` of the rows."""
-    h, draws = posterior.hypothesis, posterior.draws
-    x = draws.x.reshape(-1, len(draws.names))
-    at = [INDEX[name] for name in draws.names]
-    own = [INDEX[c.name] for e in effects for c in EFFECTS[e].coordinates]
-    rng, out = np.random.default_rng(seed), np.empty(_SIZES)
-    for k, i in enumerate(np.linspace(0, len(x) - 1, _SIZES).astype(int)):
-        values = h.values.copy()
-        values[at] = x[i]
-        without = values.copy()
-        without[own] = h.neutral[own]
-        does = np.stack(h.rows(values)) - np.stack(h.rows(without))
-        squares = np.stack([(does[:, rows] ** 2).mean(1) for rows in parts], 1)
-        out[k] = squares[:, rng.integers(0, len(parts), len(parts))].mean(1).max()
-    return out
+    does = [a - b for a, b in zip(h.rows(), h.without(effect).rows(), strict=True)]
+    size = max(float(np.sqrt((x**2).mean())) for x in does)
+    coordinates = EFFECTS[effect].coordinates
+    if not coordinates:
+        return Quantity.of_draws(size)
+    name = coordinates[0].name  # relative to whose value at the fit draws are
+    neutral = float(h.neutral[INDEX[name]])
+    away = np.abs(posterior.draws[name].reshape(-1) - neutral)
+    return Quantity.of_draws(size * away / max(abs(h[name] - neutral), 1e-12))
