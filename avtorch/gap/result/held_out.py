@@ -65,7 +65,7 @@ _SMOOTH_S = 0.5  # of the speed: little of the noise of the moment is in it
 _LINEAR, _MAP, _TIME = range(3)  # sets of columns, each with those before it
 _BODY, _ACCEL, _SPEED = range(3)  # where a column acts
 _PRIOR_SD = np.geomspace(0.001, 3.0, 12)  # of a coefficient [m/s²]
-_POOLED = (1, 200)  # coefficients a channel that tell a band's noise: free bands swallow what few coefficients show
+_POOLED = 200  # coefficients a channel that tell a band's noise: free bands swallow what few coefficients show
 _ROUNDS = 4  # alternations between coefficients and noise
 _BOX_DRAWS = 200  # of the posterior
 _LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
@@ -166,6 +166,12 @@ class Scores:
     squares: FloatArray
     nats: FloatArray
 
+    def no_worse_than(self, other: Scores) -> Scores:
+        """The better of two in each channel, and in nats."""
+        less = (self.squares.sum(1) < other.squares.sum(1))[:, None]
+        better = max(self, other, key=lambda scores: scores.nats.sum())
+        return Scores(np.where(less, self.squares, other.squares), better.nats)
+
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
@@ -201,10 +207,7 @@ class HeldOut:
     @property
     def floor(self) -> Scores:
         """The rival's, no higher than the last step in any channel."""
-        last = self.steps[-1]
-        less = (self.rival.squares.sum(1) < last.squares.sum(1))[:, None]
-        better = max(self.rival, last, key=lambda scores: scores.nats.sum())
-        return Scores(np.where(less, self.rival.squares, last.squares), better.nats)
+        return self.rival.no_worse_than(self.steps[-1])
 
     def free_gains(self, *, named: bool) -> bool:
         """Whether the free form lowers the errors of free runs, against the baseline and, where they are `named`,
@@ -243,7 +246,7 @@ def held_out_errors(
     fitted = [_taught(h, blocks) for h in chain]
     steps = [x.scores(blocks) for x in fitted]
     ends = (fitted[-1], fitted[0])
-    found = [BlackBox.of(x.hypothesis).predict(x.residuals, x.errors, blocks) for x in ends]
+    found = [BlackBox.of(x.hypothesis).predict(x.residuals, blocks) for x in ends]
     rival, ceiling = (x.scores(blocks, beside) for x, beside in zip(ends, found, strict=True))
     if free is not None:
         steps.append(_with_form(free, free.lagged, blocks))
@@ -252,7 +255,7 @@ def held_out_errors(
         blocks=blocks,
         steps=tuple(steps),
         rival=rival,
-        ceiling=ceiling,
+        ceiling=ceiling.no_worse_than(steps[0]),
         possible=found[0].possible,
         horizon_s=min(HORIZON_S, max(rows.stop - rows.start for rows in blocks.rows) * data.dt),
         free=free is not None,
@@ -466,33 +469,26 @@ class BlackBox:
         coefficients = np.stack([h.data.transform(compared(h.data, x)) for x in shown])
         return cls(h, np.array([kind for _, kind, _ in each]), shown, coefficients)
 
-    def predict(self, residuals: FloatArray, errors: FloatArray, blocks: Blocks) -> Predicted:
+    def predict(self, residuals: FloatArray, blocks: Blocks) -> Predicted:
         """What the columns foretell of each fold's blocks, taught by the `residuals` (fold, channel, frame, bin) of the
-        other blocks alone. `errors` (channel, row): of readings, each block's by the fit without it."""
+        other blocks alone."""
         h, X = self.hypothesis, self.coefficients
         rng = np.random.default_rng(0)
         normal, uniform = rng.standard_normal((_BOX_DRAWS, len(X))), rng.random(_BOX_DRAWS)
-        runs, left = blocks.free_runs(h.data, self.readings), blocks.free_runs(h.data, errors)
-        before = blocks.sums(left**2).sum(1) + 1e-12
+        runs = blocks.free_runs(h.data, self.readings)
         alike = [(blocks.taught == pattern[:, None]).all(0) for pattern in np.unique(blocks.taught, axis=1).T]
         products = [band_products(h.data, X[:, :, frames]) for frames in alike]
-        means = np.zeros((1 + len(_POOLED), len(blocks.taught), len(X)))  # the first foretells nothing
+        rows = []
         possible = np.zeros((_BOX_DRAWS, h.data.channel_count, len(blocks.rows)))
-        gains = np.zeros(means.shape[:2])
         for k, frames in enumerate(blocks.taught):
             own = np.sum([x for x, group in zip(products, alike, strict=True) if frames[group].all()], axis=0)
             taught = _TaughtProducts.of(h.data.only(frames), own, X[:, :, frames], residuals[k][:, frames])
-            draws = means[0]
-            for i, least in enumerate(_POOLED, 1):
-                means[i, k], draws = taught.posterior(self.kind, least, normal, uniform)
+            mean, draws = taught.posterior(self.kind, normal, uniform)
+            rows.append(np.tensordot(mean, self.readings, 1))
             for b in np.flatnonzero(blocks.fold == k):
                 for c in range(runs.shape[1]):
                     part = runs[:, c, blocks.rows[b]]
-                    gram, match = part @ part.T, part @ left[c, blocks.rows[b]]
-                    possible[:, c, b] = ((draws @ gram) * draws).sum(1)
-                    gains[:, k] += (2 * means[:, k] @ match - ((means[:, k] @ gram) * means[:, k]).sum(1)) / before[c]
-        others = gains.sum(1, keepdims=True) - gains
-        rows = [np.tensordot(means[way, k], self.readings, 1) for k, way in enumerate(others.argmax(0))]
+                    possible[:, c, b] = ((draws @ (part @ part.T)) * draws).sum(1)
         coefficients = [h.data.transform(compared(h.data, x)) for x in rows]
         return Predicted(np.stack(rows), np.stack(coefficients), possible)
 
@@ -518,13 +514,11 @@ class _TaughtProducts(NamedTuple):
             np.moveaxis(np.add.reduceat(squares, edges, axis=-1), -1, 0),
         )
 
-    def posterior(
-        self, kind: IntArray, least: int, normal: FloatArray, uniform: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def posterior(self, kind: IntArray, normal: FloatArray, uniform: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean (column,) and draws (draw, column) of the coefficients, from standard normal (draw, column) and uniform
         (draw,) numbers."""
         variance = _PRIOR_SD**2
-        mean, pooling = np.zeros(len(kind)), _pooling(self.data.band_size, least)
+        mean, pooling = np.zeros(len(kind)), _pooling(self.data.band_size, _POOLED)
         for _ in range(_ROUNDS):
             weights = np.linalg.inv(self._noise(mean, pooling))
             gram, match = np.tensordot(weights, self.columns, 3), np.tensordot(weights, self.mixed, 3)
