@@ -280,7 +280,7 @@ def adopt(kind: type[Effect]) -> EngineEffect:
     known = EFFECTS.get(kind.name)
     if known is not None and (known.kind is kind or (known.kind is None and TABLE.get(kind.name) is kind)):
         return known
-    coordinates = tuple(_own(kind, p) for p in kind.parameters if not p.of_onset)
+    coordinates = tuple(_own(kind, p) for p in kind.parameters)
     for c in coordinates:
         INDEX.setdefault(c.name, len(INDEX))
         COORDINATES[c.name] = c

@@ -32,8 +32,7 @@ class Parameter:
     """`name` (the key in an answer), `unit`, `neutral` value (None: any, once the others are neutral), typical range.
 
     `constraint` is the link: `"real"` the value itself, `"positive"` its log, `"negative"` the log of its opposite,
-    `"unit"` (0 to 1) its logit. `reported` False: a coordinate that is fitted but not part of the answer. `of_onset`:
-    identifiable only where an effect has an onset during a drive, and held at its prior's centre elsewhere. `possible`:
+    `"unit"` (0 to 1) its logit. `reported` False: a coordinate that is fitted but not part of the answer. `possible`:
     the physically possible range; an answer entirely outside it is reported as implausible. Default: three times the
     typical range, on the link's scale.
 
@@ -56,7 +55,6 @@ class Parameter:
     high: float
     constraint: Constraint = "positive"
     reported: bool = True
-    of_onset: bool = False
     possible: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:

@@ -239,18 +239,6 @@ def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
             SimulatorInput(**{"time": time, "command": time, **bad})  # type: ignore[arg-type]
 
 
-def test_drives_of_logs() -> None:
-    time = torch.arange(100, dtype=D).numpy() * 0.1
-    log = avtorch.Log.from_arrays(time=time, accel_cmd=0 * time + 0.5, accel=0 * time + 0.2, speed=10 + 0.5 * time)
-    drive = SimulatorInput.from_log(log)
-    assert float(drive.accel0) == 0.2  # type: ignore[arg-type]
-    assert drive.uniform
-    response = plant([gap.AerodynamicDrag()]).response(drive)
-    assert float(response.accel[0]) == pytest.approx(0.2)
-    with pytest.raises(InputError, match="segment"):
-        SimulatorInput.from_log(log, 3)
-
-
 # parameters ------------------------------------------------------------------------------------------
 
 
