@@ -305,23 +305,17 @@ def residual_figure(found: Diagnosis, against: Against) -> Figure:
 @styled
 def residual_time_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     """The residual over the whole drive, and where 99 % of a steady one with the same quartiles would lie."""
-    traces, left, axis = traces_of(found), residuals_of(found), drive_time(found)
-    along = axis.along[np.searchsorted(_rising(traces.time, traces.stretch), _rising(left.time, left.stretch))]
+    left, axis = residuals_of(found), drive_time(found)
     figure, (ax,) = panels_of(1, 2.6, narrow=narrow)
     usual = 0.0
     for label, residual in sides(found, left).items():
-        line = envelope(along, residual, left.stretch, _INTERVALS[narrow])
+        line = envelope(axis.along, residual, left.stretch, _INTERVALS[narrow])
         ax.plot(*line, color=_COLOURS[label], lw=0.9, label=label)
         usual = left.usual(residual)
     ax.axhspan(-usual, usual, color=GREY, alpha=0.25, lw=0, zorder=0)
     ax.set(xlabel=axis.label, ylabel="residual [m/s²]", xlim=(float(axis.along[0]), float(axis.along[-1])))
     legend(figure, [ax], narrow=narrow)
     return figure
-
-
-def _rising(time: FloatArray, stretch: FloatArray | np.ndarray) -> FloatArray:
-    """A key of rows that rises over all stretches, of which several logs may have the same times."""
-    return stretch * 1e7 + time
 
 
 # what to drive next ------------------------------------------------------------------------------------------------
