@@ -183,14 +183,13 @@ def _drive(
     figure: FigureBase, found: Diagnosis, panels: Mapping[str, Mapping[str, FloatArray]], *, narrow: bool
 ) -> None:
     axis, traces = drive_time(found), traces_of(found)
-    runs = traces.runs
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for ax, (name, lines) in zip(axes, panels.items(), strict=True):
         _shade(ax, axis)
         for label, values in lines.items():
             # what was logged does not begin anew with a rollout, and a simulated acceleration does not either
             anew = name == LABELS["speed"] and label not in ("command", "measured")
-            parts = np.repeat(np.arange(len(runs)), [run.stop - run.start for run in runs]) if anew else traces.stretch
+            parts = traces.piece if anew else traces.stretch
             line = envelope(axis.along, values, parts, _INTERVALS[narrow])
             ax.plot(*line, color=_COLOURS[label], lw=0.9, label=label)
         ax.set_ylabel(name)
@@ -305,17 +304,23 @@ def residual_figure(found: Diagnosis, against: Against) -> Figure:
 @styled
 def residual_time_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     """The residual over the whole drive, and where 99 % of a steady one with the same quartiles would lie."""
-    left, axis = residuals_of(found), drive_time(found)
+    traces, left, axis = traces_of(found), residuals_of(found), drive_time(found)
+    along = axis.along[np.searchsorted(_rising(traces.time, traces.stretch), _rising(left.time, left.stretch))]
     figure, (ax,) = panels_of(1, 2.6, narrow=narrow)
     usual = 0.0
     for label, residual in sides(found, left).items():
-        line = envelope(axis.along, residual, left.stretch, _INTERVALS[narrow])
+        line = envelope(along, residual, left.stretch, _INTERVALS[narrow])
         ax.plot(*line, color=_COLOURS[label], lw=0.9, label=label)
         usual = left.usual(residual)
     ax.axhspan(-usual, usual, color=GREY, alpha=0.25, lw=0, zorder=0)
     ax.set(xlabel=axis.label, ylabel="residual [m/s²]", xlim=(float(axis.along[0]), float(axis.along[-1])))
     legend(figure, [ax], narrow=narrow)
     return figure
+
+
+def _rising(time: FloatArray, stretch: FloatArray | np.ndarray) -> FloatArray:
+    """A key of rows that rises over all stretches, of which several logs may have the same times."""
+    return stretch * 1e7 + time
 
 
 # what to drive next ------------------------------------------------------------------------------------------------

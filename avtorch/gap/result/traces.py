@@ -91,6 +91,11 @@ class Traces:
         parts = [slice(int(rows[0]), int(rows[-1]) + 1) for rows in self.stretches]
         return runs_over(parts, round(HORIZON_S / self.step))
 
+    @property
+    def piece(self) -> IntArray:
+        """Number (row,) of the run that a row belongs to."""
+        return np.repeat(np.arange(len(self.runs)), [run.stop - run.start for run in self.runs])
+
     def begun_anew(self, simulated: FloatArray) -> FloatArray:
         """`simulated` (channel, row), with a speed that begins each of the `runs` at the measured one: over a whole
         drive it would drift without end on a car that rolls to a stop where its simulator does not.
