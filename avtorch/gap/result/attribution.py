@@ -105,7 +105,7 @@ def row_attribution(rows: CountedRows, h: Hypothesis, base: Hypothesis) -> RowAt
     does = rows.of_rows(_squares(h, h.predicted - base.predicted)).sum(1)
     sensed = _without_sensor(h)
     felt = np.zeros_like(does) if sensed is None else rows.of_rows(_squares(h, h.predicted - sensed)).sum(1)
-    moved = (rows.simulated(h) - rows.simulated(base)).mean(-1)
+    moved = (rows.errors(base) - rows.errors(h)).mean(-1)
     return RowAttribution(record=rows, gained=gained, paid=float(cost), does=does, felt=felt, moved=moved)
 
 

@@ -109,17 +109,13 @@ class CountedRows:
         return list(drives_of(Hypothesis(self.data)))
 
     # what a simulator makes of them ----------------------------------------------------------------------------------
-    def simulated(self, h: Hypothesis, adds: FloatArray | None = None) -> FloatArray:
-        """What a hypothesis's car, behind its recorder, shows: (channel, counted, group), a speed from the measured one
-        at the begin of its stretch on. `adds` (grid,): acceleration beyond the hypothesis's [m/s²]."""
+    def errors(self, h: Hypothesis, adds: FloatArray | None = None) -> FloatArray:
+        """Measured less what a hypothesis's car, behind its recorder, shows: (channel, counted, group), a speed from
+        the measured one at the begin of its stretch on. `adds` (grid,): acceleration beyond the hypothesis's [m/s²]."""
         accel, gained = h.on_grid()
         if adds is not None:
             accel, gained = accel + adds, gained + speed_gained(h.data.grid, adds)
-        return self._from_measured(readings(h, accel, gained))
-
-    def errors(self, h: Hypothesis, adds: FloatArray | None = None) -> FloatArray:
-        """Measured less simulated (channel, counted, group)."""
-        return self.measured - self.simulated(h, adds)
+        return self.measured - self._from_measured(readings(h, accel, gained))
 
     def rolled_out(self, simulator: GapPlant) -> FloatArray:
         """What a simulator's car, without a recorder, shows: (channel, counted, group), its speed as above."""
