@@ -23,11 +23,11 @@ from avtorch.gap.engine.priors import UNKNOWN_NATS
 from avtorch.gap.engine.sample import sample
 from avtorch.gap.result import sentences
 from avtorch.gap.result.attribution import change_attribution, localise, row_attribution
-from avtorch.gap.result.budget import MATERIAL, budget_of, families_of, shrinkage_of
+from avtorch.gap.result.budget import MATERIAL, budget_of, families_of
 from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.result.diagnosis import BlackBoxSimulator, Diagnosis
 from avtorch.gap.result.free_form import fitted_form
-from avtorch.gap.result.gap_size import Simulated, gap_size
+from avtorch.gap.result.gap_size import Simulated, gap_size, shrinkage_of
 from avtorch.gap.result.held_out import held_out_errors
 from avtorch.gap.result.hypotheses import (
     ALIAS_RATIO,

@@ -25,13 +25,11 @@ from avtorch.gap.result.free_form import (
     GAIN_SD,
     SIZES,
     Car,
-    Coefficients,
     Fit,
     FreeForm,
     LeftOut,
     Prior,
     Products,
-    Rows,
     Sizes,
     best_form,
     beyond,
@@ -40,6 +38,7 @@ from avtorch.gap.result.free_form import (
     squares_of,
 )
 from avtorch.gap.result.free_form import drive as drive_runs
+from avtorch.gap.result.output_error import Coefficients, Rows
 from avtorch.gap.simulator.effect import delay_effect
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import LogSource

@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError
-from avtorch.gap.result.free_form import STEP_S
+from avtorch.gap.result.output_error import STEP_S
 from avtorch.io import Log, LogSource, as_logs
 from avtorch.io.clock import stretches
 from avtorch.io.mapping import PEDALS

@@ -14,7 +14,7 @@ size at which that is the cost of an effect's presence is the least that shows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -28,7 +28,7 @@ from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import EFFECT_NATS
 from avtorch.gap.engine.search import Projection, tried
-from avtorch.gap.quantity import Quantity, of_fields, plain
+from avtorch.gap.quantity import RESAMPLES, Quantity, of_fields, plain, resampled
 from avtorch.gap.result.attribution import Location
 from avtorch.gap.result.counted_rows import HORIZON_S
 from avtorch.gap.result.free_form import FittedForm
@@ -51,12 +51,8 @@ MATERIAL = 0.03
 unexplained of the gap."""
 
 _UNNAMED = "a force of command and speed without a name"
-RESAMPLES = 400
-"""Of blocks, with replacement."""
 _NOTHING = 1e-3  # of the energy before, below which free runs show no gap
-_NO_GAP = 0.1  # share of the error before that is within the floor: nothing to close
 _SIZES = 48  # draws of the size of a family
-_DENSITY = "log_predictive_density"
 
 
 @dataclass(frozen=True)
@@ -336,48 +332,6 @@ def percent(share: float) -> str:
 
 
 # from held-out blocks -------------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class MetricShrinkage:
-    """Errors by one measure: `before` the effect is added, `after`, and the `floor` that no model can go below.
-
-    `closed`: (before - after) / (before - floor), None where there is almost nothing to close. Rollout errors are root
-    mean squares [m/s², m/s]; densities are mean log densities per row [nats], of which higher is better.
-
-    `horizon_s`: length of the rollouts [s], None for those of whole drives and for densities.
-    """
-
-    before: float
-    after: float
-    floor: float
-    closed: Quantity | None
-    horizon_s: float | None = None
-
-
-@dataclass(frozen=True)
-class Shrinkage:
-    """How far the gap shrinks on held-out blocks of the drives.
-
-    `metric`: the one of `by_metric` in which the gap is clearest. `ceiling`: error after a flexible black box is added
-    to the bare baseline, by metric. `blocks`: number of held-out blocks. `by_drives`: whole drives were held out.
-    """
-
-    metric: str
-    by_metric: Mapping[str, MetricShrinkage]
-    ceiling: Mapping[str, float]
-    blocks: int
-    by_drives: bool = False
-
-    @property
-    def top(self) -> MetricShrinkage:
-        return self.by_metric[self.metric]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The object `shrinkage` of `diagnosis.json`."""
-        out = of_fields(self) | of_fields(self.top)
-        out |= {"heldout": True, "heldout_by": "drives" if out.pop("by_drives") else "blocks"}
-        return out | {"placebo": {"effect": None, "closed": None}, "chosen": None}
-
-
 def budget_of(
     average: ModelAverage,
     posterior: ParameterPosterior,
@@ -453,26 +407,6 @@ def budget_of(
         horizon_s=held.horizon_s,
         by_drives=held.blocks.by_drives,
     )
-
-
-def shrinkage_of(held: HeldOut, seed: int = 0) -> Shrinkage:
-    """How far the gap shrinks on held-out blocks with all causes, by measure."""
-    four = (held.steps[0], held.steps[-1], held.floor, held.ceiling)
-    sizes, framed = held.blocks.sizes, np.flatnonzero(held.frame_rows)  # a block between two frames has no density
-    out: dict[str, MetricShrinkage] = {}
-    ceiling: dict[str, float] = {}
-    for c, channel in enumerate(held.data.channels):
-        name = f"rollout_rmse_{channel}"
-        levels = np.sqrt(resampled(np.stack([x.squares[c] for x in four]), seed) / resampled(sizes, seed))
-        out[name], ceiling[name] = _metric(levels, held.horizon_s, _NO_GAP), float(levels[3, 0])
-    # the measure in which the gap shows most
-    top = max(out, key=lambda k: out[k].before / max(out[k].floor, 1e-12))
-    if all(x.closed is None for x in out.values()):
-        top = _DENSITY
-    nats = np.stack([x.nats[framed] for x in four])
-    levels = resampled(nats, seed) / resampled(held.frame_rows[framed], seed)
-    out[_DENSITY], ceiling[_DENSITY] = _metric(levels, None, 1e-3, better=np.maximum), float(levels[3, 0])
-    return Shrinkage(top, out, ceiling, len(held.blocks.rows), held.blocks.by_drives)
 
 
 def families_of(
@@ -580,28 +514,6 @@ def _still(held: HeldOut, seed: int) -> Quantity:
     low, high = float(np.quantile(did, 0.05)), float(np.quantile(np.maximum(did, could), 0.95))
     mean = float(did[0])
     return Quantity(mean, float(did.std()), min(low, mean), max(high, mean))
-
-
-def resampled(x: FloatArray, seed: int) -> FloatArray:
-    """Means (..., draw) over resampled blocks of `x` (..., block); the first draw is the blocks themselves."""
-    blocks = x.shape[-1]
-    pick = np.random.default_rng(seed).integers(0, blocks, (RESAMPLES, blocks))
-    pick[0] = np.arange(blocks)
-    return x[..., pick].mean(-1)
-
-
-def _metric(
-    levels: FloatArray, horizon: float | None, nothing: float, better: Callable[..., Any] = np.minimum
-) -> MetricShrinkage:
-    """Of `levels` (before, after, floor and ceiling; draw) under resampled blocks; `nothing`: of a gap, relative to an
-    error, or of a density [nats]."""
-    before, after = levels[:2]
-    bottom = better(levels[2], after)
-    gap, closed = before - bottom, None
-    if abs(gap[0]) >= nothing * (before[0] if better is np.minimum else 1.0):
-        shares = (before - after) / np.where(gap == 0, np.inf, gap)
-        closed = Quantity.of_resampled(shares[0], shares)
-    return MetricShrinkage(float(before[0]), float(after[0]), float(bottom[0]), closed, horizon)
 
 
 def _share_of_noise(posterior: ParameterPosterior, name: str) -> float | None:

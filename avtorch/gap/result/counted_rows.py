@@ -6,10 +6,15 @@ passes through such rows.
 
 A simulated speed is compared in free runs, each begun at what was measured: over a whole drive the speed of any model
 drifts away. An acceleration needs no beginning, as the lag forgets it.
+
+Commands, and the speed that effects read, are the log's. Blocks are groups of neighbouring hops of the lapped
+transform's frames, dealt into folds; with several drives of similar length whole drives are held out. Frames that reach
+into a held-out block teach nothing.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -17,7 +22,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from avtorch.arrays import FloatArray, IntArray
+from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.gap.engine.drive_data import DriveData, Grid
 from avtorch.gap.engine.hypothesis import Hypothesis, drives_of
 from avtorch.gap.simulator.plant import GapPlant
@@ -31,6 +36,12 @@ BEGIN_S = 0.5
 """Over which the measured speed at the begin of a free run is averaged [s]."""
 RATE_HZ = 20.0
 """Rows are averaged as long as the resulting rate is at least this [Hz]."""
+FOLDS = 5
+FEWEST = 5
+"""Blocks without which nothing is held out."""
+_LEAST_TAUGHT = 3  # frames: one more than channels, or a band's covariance is not known
+_BLOCKS = 20  # of a long drive
+_DRIVES = 3  # fewest drives of which whole ones are held out, none of them longer than half of all
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,3 +203,89 @@ def speed_gained(grid: Grid, accel: FloatArray) -> FloatArray:
     """Speed [m/s] that an acceleration (grid,) [m/s²] beyond the plant's adds."""
     step = np.where(grid.starts, 0.0, np.diff(grid.time, prepend=grid.time[:1]))
     return np.cumsum(step * np.concatenate([accel[:1], accel[:-1]]))
+
+
+# blocks ---------------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Blocks of rows, in order, and the `fold` (block,) that holds each out. Of frames: the block (frame,) of their
+    first hop, and the folds' masks `taught` (fold, frame). `by_drives`: folds are whole drives.
+
+    """
+
+    rows: tuple[slice, ...]
+    fold: IntArray
+    block_of_frame: IntArray = field(repr=False)
+    taught: BoolArray = field(repr=False)
+    by_drives: bool = False
+
+    @classmethod
+    def of(cls, data: DriveData) -> Blocks | None:
+        """The blocks of the drives; None where there are fewer than `FEWEST`, or frames too few to teach."""
+        M = data.frame_rows
+        hops = sum(count + 1 for _, count in data.frames)
+        most = max(hops // FEWEST, 1)  # hops of a block
+        size = min(max(2, math.ceil(HORIZON_S / data.hop_s), round(hops / _BLOCKS)), most)  # of 1, two frames are lost
+        rows: list[slice] = []
+        touched: list[tuple[int, int]] = []  # first and last block of each frame
+        for first, count in data.frames:
+            parts = max(1, round((count + 1) / size))
+            edges = np.round(np.linspace(0, count + 1, parts + 1)).astype(int)
+            block = len(rows) + np.repeat(np.arange(parts), np.diff(edges))
+            touched += pairwise(block.tolist())
+            rows += [slice(first + int(a) * M, first + int(b) * M) for a, b in pairwise(edges)]
+        if len(rows) < FEWEST:
+            return None
+        fold, by_drives = _folds(data, rows)
+        frames = np.array(touched)[data.used]
+        taught = np.array([(fold[frames] != k).all(1) for k in range(fold.max() + 1)])
+        if taught.sum(1).min() < _LEAST_TAUGHT:
+            return None
+        return cls(tuple(rows), fold, frames[:, 0], taught, by_drives)
+
+    @property
+    def sizes(self) -> FloatArray:
+        """Rows (block,)."""
+        return np.array([rows.stop - rows.start for rows in self.rows], float)
+
+    def sums(self, x: FloatArray) -> FloatArray:
+        """Sums (..., block) over each block's rows of `x` (..., row)."""
+        return np.stack([x[..., rows].sum(-1) for rows in self.rows], -1)
+
+    def stitched(self, of_folds: Sequence[FloatArray] | FloatArray) -> FloatArray:
+        """(channel, row): each block's by the fit that was made without it; 0 outside."""
+        out = np.zeros_like(of_folds[0])
+        for rows, k in zip(self.rows, self.fold, strict=True):
+            out[:, rows] = of_folds[k][:, rows]
+        return out
+
+    def free_runs(self, data: DriveData, errors: FloatArray) -> FloatArray:
+        """Errors (..., channel, row) of readings as those of free runs, begun anew every `HORIZON_S` in each block."""
+        out = errors.copy()
+        if data.speed is not None:
+            out[..., -1, :] = free_runs(errors[..., -1, :], runs_over(self.rows, round(HORIZON_S / data.dt)), data.dt)
+        return out
+
+
+def _folds(data: DriveData, rows: Sequence[slice]) -> tuple[IntArray, bool]:
+    """The fold (block,) of each block: whole logs, about equal shares of the rows, or every so-many-th block."""
+    log = data.log[[b.start for b in rows]]
+    sizes = np.bincount(log, [b.stop - b.start for b in rows])
+    drives = [int(k) for k in np.argsort(-sizes, kind="stable") if sizes[k] > 0]
+    if len(drives) < _DRIVES or sizes.max() > 0.5 * sizes.sum():
+        return np.arange(len(rows)) % min(FOLDS, len(rows)), False
+    held, fold = np.zeros(min(FOLDS, len(drives))), np.zeros(len(sizes), np.int64)
+    for k in drives:
+        fold[k] = held.argmin()
+        held[fold[k]] += sizes[k]
+    return fold[log], True
+
+
+def measured_readings(data: DriveData) -> FloatArray:
+    """(channel, row)."""
+    return np.stack([x for x in (data.accel, data.speed) if x is not None])
+
+
+def compared(data: DriveData, rows: FloatArray) -> list[FloatArray]:
+    """Readings (channel, row) as the channels that the likelihood compares: acceleration and differenced speed."""
+    return data.channel_rows(None if data.accel is None else rows[0], None if data.speed is None else rows[-1])

@@ -9,10 +9,6 @@ products B, held out,
 
 (matrix Student; Gelman et al. 2013, 3.6). No free run foretells which messages are lost, so all have arrived.
 
-Commands, and the speed that effects read, are the log's. Blocks are groups of neighbouring hops of the lapped
-transform's frames, dealt into folds; with several drives of similar length whole drives are held out. Frames that reach
-into a held-out block teach nothing.
-
 What a black box still foretells of held-out blocks: a bound on what any model could.
 
     r = X beta + n,    beta ~ N(0, sd^2),    X: what forces that commands, speed and time could make do to all channels
@@ -46,15 +42,8 @@ from avtorch.gap.engine.free_forms import band_products
 from avtorch.gap.engine.gauss_newton import fit, linear_priors, linearised, penalty
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance, whiten
-from avtorch.gap.result.counted_rows import HORIZON_S, free_runs, readings, runs_over, speed_gained
+from avtorch.gap.result.counted_rows import HORIZON_S, Blocks, compared, measured_readings, readings, speed_gained
 from avtorch.gap.result.free_form import FittedForm
-
-FOLDS = 5
-FEWEST = 5
-"""Blocks without which nothing is held out."""
-_LEAST_TAUGHT = 3  # frames: one more than channels, or a band's covariance is not known
-_BLOCKS = 20  # of a long drive
-_DRIVES = 3  # fewest drives of which whole ones are held out, none of them longer than half of all
 
 _STEPS = 3  # of a fold's fit
 _DAMPED = (1.0, 0.3, 0.1)  # of a step that loses
@@ -71,93 +60,6 @@ _BOX_DRAWS = 200  # of the posterior
 _LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
 
 
-# blocks ---------------------------------------------------------------------------------------------------------------
-@dataclass(frozen=True, eq=False)
-class Blocks:
-    """Blocks of rows, in order, and the `fold` (block,) that holds each out. Of frames: the block (frame,) of their
-    first hop, and the folds' masks `taught` (fold, frame). `by_drives`: folds are whole drives.
-
-    """
-
-    rows: tuple[slice, ...]
-    fold: IntArray
-    block_of_frame: IntArray = field(repr=False)
-    taught: BoolArray = field(repr=False)
-    by_drives: bool = False
-
-    @classmethod
-    def of(cls, data: DriveData) -> Blocks | None:
-        """The blocks of the drives; None where there are fewer than `FEWEST`, or frames too few to teach."""
-        M = data.frame_rows
-        hops = sum(count + 1 for _, count in data.frames)
-        most = max(hops // FEWEST, 1)  # hops of a block
-        size = min(max(2, math.ceil(HORIZON_S / data.hop_s), round(hops / _BLOCKS)), most)  # of 1, two frames are lost
-        rows: list[slice] = []
-        touched: list[tuple[int, int]] = []  # first and last block of each frame
-        for first, count in data.frames:
-            parts = max(1, round((count + 1) / size))
-            edges = np.round(np.linspace(0, count + 1, parts + 1)).astype(int)
-            block = len(rows) + np.repeat(np.arange(parts), np.diff(edges))
-            touched += pairwise(block.tolist())
-            rows += [slice(first + int(a) * M, first + int(b) * M) for a, b in pairwise(edges)]
-        if len(rows) < FEWEST:
-            return None
-        fold, by_drives = _folds(data, rows)
-        frames = np.array(touched)[data.used]
-        taught = np.array([(fold[frames] != k).all(1) for k in range(fold.max() + 1)])
-        if taught.sum(1).min() < _LEAST_TAUGHT:
-            return None
-        return cls(tuple(rows), fold, frames[:, 0], taught, by_drives)
-
-    @property
-    def sizes(self) -> FloatArray:
-        """Rows (block,)."""
-        return np.array([rows.stop - rows.start for rows in self.rows], float)
-
-    def sums(self, x: FloatArray) -> FloatArray:
-        """Sums (..., block) over each block's rows of `x` (..., row)."""
-        return np.stack([x[..., rows].sum(-1) for rows in self.rows], -1)
-
-    def stitched(self, of_folds: Sequence[FloatArray] | FloatArray) -> FloatArray:
-        """(channel, row): each block's by the fit that was made without it; 0 outside."""
-        out = np.zeros_like(of_folds[0])
-        for rows, k in zip(self.rows, self.fold, strict=True):
-            out[:, rows] = of_folds[k][:, rows]
-        return out
-
-    def free_runs(self, data: DriveData, errors: FloatArray) -> FloatArray:
-        """Errors (..., channel, row) of readings as those of free runs, begun anew every `HORIZON_S` in each block."""
-        out = errors.copy()
-        if data.speed is not None:
-            out[..., -1, :] = free_runs(errors[..., -1, :], runs_over(self.rows, round(HORIZON_S / data.dt)), data.dt)
-        return out
-
-
-def _folds(data: DriveData, rows: Sequence[slice]) -> tuple[IntArray, bool]:
-    """The fold (block,) of each block: whole logs, about equal shares of the rows, or every so-many-th block."""
-    log = data.log[[b.start for b in rows]]
-    sizes = np.bincount(log, [b.stop - b.start for b in rows])
-    drives = [int(k) for k in np.argsort(-sizes, kind="stable") if sizes[k] > 0]
-    if len(drives) < _DRIVES or sizes.max() > 0.5 * sizes.sum():
-        return np.arange(len(rows)) % min(FOLDS, len(rows)), False
-    held, fold = np.zeros(min(FOLDS, len(drives))), np.zeros(len(sizes), np.int64)
-    for k in drives:
-        fold[k] = held.argmin()
-        held[fold[k]] += sizes[k]
-    return fold[log], True
-
-
-def measured_readings(data: DriveData) -> FloatArray:
-    """(channel, row)."""
-    return np.stack([x for x in (data.accel, data.speed) if x is not None])
-
-
-def compared(data: DriveData, rows: FloatArray) -> list[FloatArray]:
-    """Readings (channel, row) as the channels that the likelihood compares: acceleration and differenced speed."""
-    return data.channel_rows(None if data.accel is None else rows[0], None if data.speed is None else rows[-1])
-
-
-# held out -------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Scores:
     """Of one model: sums of squared errors of free runs (channel, block) [(m/s²)², (m/s)²], and of log densities

@@ -14,8 +14,9 @@ from avtorch.gap import ConstantResistance, ForceTable, GapPlant, Gust, Resistan
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.recorder import base_fit
-from avtorch.gap.result.free_form import Coefficients, FittedForm, Rows, Runs, Sizes, fitted_form
+from avtorch.gap.result.free_form import FittedForm, Sizes, fitted_form
 from avtorch.gap.result.held_out import HeldOut, Scores
+from avtorch.gap.result.output_error import Coefficients, Rows, Runs
 from avtorch.io import Log
 from tests.gap.cars import log_of
 

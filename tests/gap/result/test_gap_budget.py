@@ -11,7 +11,8 @@ import pytest
 import avtorch
 from avtorch.errors import InputError
 from avtorch.gap import ConstantResistance, DeadBand, DeadTime, Effect, SensorBias
-from avtorch.gap.result.budget import Budget, shrinkage_of
+from avtorch.gap.result.budget import Budget
+from avtorch.gap.result.gap_size import shrinkage_of
 from avtorch.gap.result.held_out import Scores
 from tests.gap.cars import log_of
 
