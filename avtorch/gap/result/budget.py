@@ -30,9 +30,9 @@ from avtorch.gap.engine.priors import EFFECT_NATS
 from avtorch.gap.engine.search import Projection, tried
 from avtorch.gap.quantity import RESAMPLES, Quantity, of_fields, plain, resampled
 from avtorch.gap.result.attribution import Location
-from avtorch.gap.result.counted_rows import HORIZON_S
+from avtorch.gap.result.counted_rows import HORIZON_S, Blocks
 from avtorch.gap.result.free_form import FittedForm
-from avtorch.gap.result.held_out import Blocks, HeldOut
+from avtorch.gap.result.held_out import HeldOut
 from avtorch.gap.result.hypotheses import (
     LIKELY,
     AnswerPart,
