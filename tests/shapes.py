@@ -26,7 +26,7 @@ from torch import Tensor
 
 import avtorch.arrays
 
-PACKAGES = ("avtorch.vehicle", "avtorch.inference", "avtorch.gap.drive_record")
+PACKAGES = ("avtorch.vehicle", "avtorch.inference")
 SHAPES = ("Bool", "Complex", "Float", "Inexact", "Int", "Real")
 
 _NUMBERS = BeartypeConf(is_pep484_tower=True)  # an int is a float, as type checkers have it

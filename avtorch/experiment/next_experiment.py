@@ -15,7 +15,7 @@ from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.experiment.manoeuvres import Limits, Manoeuvre, library
 from avtorch.experiment.prediction import Information, ManoeuvrePrediction, information, responses
-from avtorch.gap.drive_record import grouped
+from avtorch.gap.result.counted_rows import grouped
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.io import atomic

@@ -18,7 +18,7 @@ from scipy.special import logsumexp
 
 from avtorch.arrays import FloatArray
 from avtorch.experiment.manoeuvres import Manoeuvre
-from avtorch.gap.effects import RoadGrade
+from avtorch.gap.effects.road_grade import RoadGrade
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.gap.simulator.simulator_input import Response, SimulatorInput

@@ -1,6 +1,6 @@
 """Which of two simulators is nearer to a car: both driven by the commands of its drives, scored by one measure.
 
-Both are scored on the same rows, by the errors of rollouts over 10 s as `avtorch.compare` has them. Nothing is fitted
+Both are scored on the same rows, by the errors of free runs of 10 s as `avtorch.compare` has them. Nothing is fitted
 to the car: the surrogates are fitted to the simulators' own output. So nothing has to be held out.
 
 Let `s_b` and `t_b` be the shares of block `b` in the squared errors S and T of the two. The logarithm of the ratio of
@@ -28,7 +28,6 @@ from os import PathLike, fspath
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
@@ -38,11 +37,10 @@ from avtorch.errors import InputError
 from avtorch.external.external_simulator import ExternalSimulator, Progress
 from avtorch.external.simulator import DrivenPlant
 from avtorch.external.surrogate import Surrogate, surrogate_of
-from avtorch.gap.compare import LEVEL
-from avtorch.gap.drive_record import FEWEST_BLOCKS, Record, blocks_of
+from avtorch.gap.compare import LEVEL, check_length, whole_runs
 from avtorch.gap.quantity import Quantity, of_fields, unit_of, words_of
+from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.result.log_facts import LogFacts
-from avtorch.gap.rollout_errors import HORIZON_S, block_squares, reached, rolled_out
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log, LogSource, as_logs
@@ -215,30 +213,23 @@ class LogRatio:
 
 @dataclass(frozen=True, eq=False)
 class ScoredBlocks:
-    """`blocks` of a record, by which rollouts of `horizon_s` [s] are scored."""
+    """`blocks` of rows, free runs of `horizon_s` [s], by which simulators are scored."""
 
-    record: Record = field(repr=False)
+    rows: CountedRows = field(repr=False)
     blocks: tuple[slice, ...]
     horizon_s: float
 
     @classmethod
-    def of(cls, record: Record) -> ScoredBlocks:
-        """Those of a record. Raises `InputError` for less than five."""
-        blocks = tuple(blocks_of(record, fewest=FEWEST_BLOCKS))
-        if len(blocks) < FEWEST_BLOCKS:
-            raise InputError(
-                f"logs: found {len(blocks)} blocks of 4 s of usable driving, needs {FEWEST_BLOCKS} or more"
-            )
-        return cls(record, blocks, reached(record, HORIZON_S))
+    def of(cls, rows: CountedRows) -> ScoredBlocks:
+        """Those of drives. Raises `InputError` where they are less than five times 4 s."""
+        check_length(rows, "logs")
+        horizon, (blocks,) = whole_runs([rows])
+        return cls(rows, tuple(blocks), horizon)
 
-    def squares(self, errors: FloatArray, lag: float) -> dict[str, FloatArray]:
-        """Squared errors by metric (block,), of a long rollout's `errors` (channel, counted, group); `lag` [s] of its
-        actuator."""
+    def squares(self, errors: FloatArray) -> dict[str, FloatArray]:
+        """Squared errors by metric (block,), of a rollout's `errors` (channel, counted, group)."""
         least = _LEAST**2 * self._rows
-        return {
-            name: np.maximum(x, least)
-            for name, x in block_squares(self.record, errors, self.blocks, lag, self.horizon_s).items()
-        }
+        return {name: np.maximum(x, least) for name, x in self.rows.squares(errors, self.blocks).items()}
 
     def log_ratio(self, one: Mapping[str, FloatArray], two: Mapping[str, FloatArray]) -> LogRatio:
         """Of the errors of `two` to those of `one`, squares (block,) by metric; the mean over the metrics."""
@@ -253,7 +244,7 @@ class ScoredBlocks:
 
     @property
     def _rows(self) -> FloatArray:
-        return np.array([(b.stop - b.start) * self.record.group for b in self.blocks], dtype=float)
+        return np.array([(b.stop - b.start) * self.rows.group for b in self.blocks], dtype=float)
 
 
 _SAME = 0.01  # relative difference of parameters that is none
@@ -269,11 +260,11 @@ def differences(
     """
     chains = [surrogate.plant for surrogate in surrogates]
     base, donor = chains[far], chains[1 - far]
-    own = rolled_out(scored.record, base)
+    own = scored.rows.rolled_out(base)
     sides = {name: [_values(surrogate, name) for surrogate in surrogates] for name in _parts(chains)}
     apart = [name for name, (one, two) in sides.items() if not _alike(one, two)]
     known: dict[frozenset[str], LogRatio] = {}
-    as_it_is = scored.squares(errors, float(base.T_L))
+    as_it_is = scored.squares(errors)
 
     def with_parts(names: frozenset[str]) -> LogRatio:
         """Of the error with these parts as in the other one to what it is."""
@@ -281,8 +272,8 @@ def differences(
             changed = base
             for name in sorted(names):
                 changed = _with_part(changed, donor, name)
-            moved = errors + own - rolled_out(scored.record, changed) if names else errors
-            known[names] = scored.log_ratio(as_it_is, scored.squares(moved, float(changed.T_L)))
+            moved = errors + own - scored.rows.rolled_out(changed) if names else errors
+            known[names] = scored.log_ratio(as_it_is, scored.squares(moved))
         return known[names]
 
     alone = sorted(apart, key=lambda name: -abs(with_parts(frozenset((name,))).mean))
@@ -392,10 +383,9 @@ def compare_simulators(
         surrogate_of(outputs, progress=steps) if own is None else Surrogate(own, {})
         for (_, own), (outputs, _) in zip(given, rolled, strict=True)
     ]
-    scored = ScoredBlocks.of(Record.of(cars))
-    errors = [_errors(scored.record, outputs) for outputs, _ in rolled]
-    lags = [float(surrogate.plant.T_L) for surrogate in surrogates]
-    one, two = (scored.squares(e, lag) for e, lag in zip(errors, lags, strict=True))
+    scored = ScoredBlocks.of(CountedRows.of(cars))
+    errors = [scored.rows.measured - scored.rows.of_logs(outputs) for outputs, _ in rolled]
+    one, two = (scored.squares(e) for e in errors)
     both = scored.log_ratio(one, two)
     far = 0 if both.mean < 0 else 1
     told = [
@@ -450,15 +440,6 @@ def _scored(logs: Sequence[Log], rolled: Sequence[Sequence[Log]]) -> list[Log]:
         replace(log, engaged=log.engaged & one.engaged & two.engaged, **absent)
         for log, one, two in zip(logs, *rolled, strict=True)
     ]
-
-
-def _errors(record: Record, outputs: Sequence[Log]) -> FloatArray:
-    """(channel, counted, group): the car's less the simulator's."""
-    simulated = [
-        record.at_counted_rows([torch.as_tensor(getattr(outputs[cut.log], name)[cut.rows]) for cut in record.cuts])
-        for name in record.channels
-    ]
-    return record.measured - np.stack(simulated)
 
 
 def _told(

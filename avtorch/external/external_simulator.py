@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
+import torch
 from scipy.integrate import trapezoid
 
 from avtorch.arrays import FloatArray
@@ -233,11 +234,15 @@ def responses(drives: Log, plant: GapPlant) -> dict[str, FloatArray]:
     """What `plant` does in `drives` by the channels that these have, (time,): acceleration [m/s²] and speed [m/s], anew
     from each segment's first row. Rows under the driver keep what is there."""
     found = {name: values.copy() for name in ("accel", "speed") if (values := getattr(drives, name)) is not None}
+    assert drives.accel_cmd is not None
     for segment in range(int(drives.segment[-1]) + 1):
         rows = drives.segment == segment
         if rows.sum() < 2 or not drives.engaged[rows].any():  # under the driver there is no simulator
             continue
-        response = plant.response(SimulatorInput.from_log(drives, segment))
+        time, command = torch.as_tensor(drives.elapsed[rows]), torch.as_tensor(drives.accel_cmd[rows])
+        speed = None if drives.speed is None else torch.as_tensor(drives.speed[rows])
+        accel0 = None if drives.accel is None else float(drives.accel[rows][0])
+        response = plant.response(SimulatorInput(time, command, speed, accel0, drives.accel_kind == "specific-force"))
         answers = {"accel": response.accel_measured, "speed": response.speed_measured}
         for name, values in found.items():
             values[rows] = answers[name].numpy()

@@ -270,7 +270,7 @@ def _of_car(cause: str) -> list[Parameter]:
     effect = EFFECTS.get(cause)
     if effect is None or effect.of_the_drive:
         return []
-    return [p for p in (*effect.parameters, *effect.derived) if p.reported and p.constraint != "interval"]
+    return [p for p in (*effect.parameters, *effect.derived) if p.reported]
 
 
 def _belief(parameter: Parameter, stats: Mapping[str, Any]) -> tuple[float, float] | None:

@@ -6,10 +6,9 @@ estimator of White 1982), and is never less than the posterior's. Differences th
 manoeuvres therefore count as spread, not as a change.
 
 The cause: T_L alone, K_L alone, dead time, or an effect of the table, whichever explains the drives after best in one
-model of both sides that shares all the rest (`engine.joint`). Where `T_L` or `K_L` differ, the same model tells a
-change of dead time, which resembles a longer lag, from one of lag and gain.
+model of both sides that shares all the rest (`engine.joint`).
 
-The simulator: rollout errors over both sets, and their ratio over bootstrapped blocks.
+The simulator: errors of free runs over both sets, and their ratio over bootstrapped runs.
 """
 
 from __future__ import annotations
@@ -25,18 +24,16 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.gap.drive_record import FEWEST_BLOCKS, Record, blocks_of
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import jacobian, prior_terms, whitened_jacobian
 from avtorch.gap.engine.joint import JointModel, block_scores
 from avtorch.gap.engine.priors import ONE_CHANNEL_HZ
 from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.cause_of_change import cause_of_change, dead_time_test
-from avtorch.gap.result.comparison import Change, ChangeCause, Comparison, DeadTimeTest, SimulatorChange
+from avtorch.gap.result.comparison import Change, ChangeCause, Comparison, SimulatorChange, cause_of_change
+from avtorch.gap.result.counted_rows import HORIZON_S, CountedRows, runs_over
 from avtorch.gap.result.diagnosis import BlackBoxSimulator
 from avtorch.gap.result.log_facts import LogFacts
-from avtorch.gap.rollout_errors import HORIZON_S, block_squares, reached, rolled_out
 from avtorch.gap.simulator.effect import Effect, chosen_effects
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log, LogSource, as_logs
@@ -47,10 +44,10 @@ Simulator = GapPlant | str | PathLike[str] | None
 LEVEL = 0.04
 """Significance level: with one car, "no change" is the right answer in more than 95 % of comparisons."""
 _CAR = ("T_L", "K_L")
-_TURNS = 12  # of Gauss-Newton
+_FEWEST = 5  # blocks on either side, and runs
+_SHORTEST_S = 4.0  # of a block
 _DRAWS = 2000
 _HORIZONS = (HORIZON_S, 5.0, 2.0, 1.0)
-_WHOLE_SHARE = 0.4  # of a side's rows that have a whole rollout behind them
 
 
 @shows_progress
@@ -109,7 +106,7 @@ def compare(
         told("lag and gain of both drives", 0, 2)
     fitted = [_LagAndGain.of(logs, plants[0], name) for logs, name in zip(sides, ("before", "after"), strict=True)]
     one, two = fitted
-    if one.record.channels != two.record.channels:
+    if one.rows.channels != two.rows.channels:
         raise InputError("before, after: have different channels; needs accel, speed or both in both")
     away = two.mean - one.mean
     covariance = one.covariance + two.covariance
@@ -131,20 +128,19 @@ def compare(
     simulators = [p if b is not None else one.fitted(plants[0]) for p, b in zip(plants, given, strict=True)]
     facts = [LogFacts.of(logs) for logs in sides]
     same = replace(facts[0], name="") == replace(facts[1], name="")
-    horizon = _horizon(fitted)
-    gap = _gaps(fitted, simulators, horizon, same=same)
+    horizon, runs = whole_runs([side.rows for side in fitted])
+    gap = _gaps(fitted, simulators, horizon, runs, same=same)
     simulator = _simulator_change(gap)
     changed = p_value < level
-    cause, of_two = None, None
+    cause = None
     if told is not None:
         told("one model of both drives", 1, 2)
     try:
         model = None if same else JointModel.of(DriveData.of([*sides[0], *sides[1]]), len(sides[0]), plants[0])
-    except InputError:  # long enough for lag and gain, too short for a cause
+    except InputError:  # other rates, or kinds of accelerometer
         model = None
     if model is not None:
         cause = cause_of_change(model, kinds, progress=told)
-        of_two = dead_time_test(model) if changed else None
     return Comparison(
         before=facts[0],
         after=facts[1],
@@ -153,10 +149,7 @@ def compare(
         p_value=p_value,
         changed=changed,
         simulator=simulator,
-        why=_sentence(
-            car, p_value, simulator, changed, of_two, cause, same=same, simulators=1 + (given[0] is not given[1])
-        ),
-        dead_time_test=of_two,
+        why=_sentence(car, p_value, simulator, changed, cause, same=same, simulators=1 + (given[0] is not given[1])),
         cause=cause,
         horizon_s=horizon,
     )
@@ -164,27 +157,19 @@ def compare(
 
 @dataclass(frozen=True, eq=False)
 class _LagAndGain:
-    """One set of drives, `record`: `mean` and `covariance` of ln T_L and ln K_L, estimated from `blocks` blocks."""
+    """One set of drives, `rows`: `mean` and `covariance` of ln T_L and ln K_L, estimated from `blocks` blocks."""
 
-    record: Record = field(repr=False)
+    rows: CountedRows = field(repr=False)
     mean: FloatArray
     covariance: FloatArray = field(repr=False)
     blocks: int
 
     @classmethod
     def of(cls, logs: Sequence[Log], base: GapPlant, which: str) -> _LagAndGain:
-        record = Record.of(logs)
-        blocks = blocks_of(record, fewest=FEWEST_BLOCKS)
-        if len(blocks) < FEWEST_BLOCKS:
-            raise InputError(
-                f"{which}: found {len(blocks)} blocks of 4 s of usable driving, needs {FEWEST_BLOCKS} or more"
-            )
-        try:
-            data = DriveData.of(logs)
-        except InputError:  # no stretch that is long enough for the engine
-            mean, information, scores = _by_rows(record, base, blocks)
-        else:
-            mean, information, scores = _by_engine(data, base)
+        data = DriveData.of(logs)
+        rows = CountedRows.of(logs, data)
+        check_length(rows, which)
+        mean, information, scores = _fitted(data, base)
         scores = scores - scores.mean(1, keepdims=True)
         count = scores.shape[1]
         between = scores @ scores.T * count / (count - 1)
@@ -193,14 +178,14 @@ class _LagAndGain:
         # in coordinates that whiten the posterior: the spread is no smaller than the posterior's in any direction
         sizes, axes = np.linalg.eigh(root.T @ between @ root)
         spread = root @ axes @ np.diag(np.maximum(sizes, 1.0)) @ axes.T @ root.T
-        return cls(record, mean, spread[:2, :2], count)
+        return cls(rows, mean, spread[:2, :2], count)
 
     def fitted(self, base: GapPlant) -> GapPlant:
         """The simulator with this lag and gain."""
         return base.with_values(dict(zip(_CAR, np.exp(self.mean).tolist(), strict=True)))
 
 
-def _by_engine(data: DriveData, base: GapPlant) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _fitted(data: DriveData, base: GapPlant) -> tuple[FloatArray, FloatArray, FloatArray]:
     """ln T_L and ln K_L (2,) behind a recorder; information (parameter, parameter) and scores (parameter, block)."""
     alone = data.channel_count == 1
     h = base_fit(data.below(ONE_CHANNEL_HZ) if alone else data, base, alone=alone)
@@ -213,73 +198,43 @@ def _by_engine(data: DriveData, base: GapPlant) -> tuple[FloatArray, FloatArray,
     return np.log(here), information, block_scores(h, h.covariance, J, h.residual) * slopes[:, None]
 
 
-def _by_rows(record: Record, base: GapPlant, blocks: Sequence[slice]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The same of rows with white noise of any covariance, for stretches that are too short for a spectrum."""
-
-    def errors(z: FloatArray) -> FloatArray:
-        """(channel, row): of acceleration, and of the speed's rise between rows."""
-        car = base.with_values(dict(zip(_CAR, np.exp(z).tolist(), strict=True)))
-        e = (record.measured - rolled_out(record, car)).mean(-1)
-        for k, channel in enumerate(record.channels):
-            if channel == "speed":
-                e[k] = np.diff(e[k], prepend=e[k, :1]) / record.dt
-                e[k, record.starts] = 0.0
-        return e
-
-    z: FloatArray = np.log([float(base.T_L), float(base.K_L)])
-    information: FloatArray = np.eye(2)
-    scores: FloatArray = np.zeros((2, record.rows))
-    step = 1e-3
-    for _ in range(_TURNS):
-        e = errors(z)
-        weight = np.asarray(np.linalg.inv(e @ e.T / e.shape[1]), np.float64)
-        J = np.stack([(e - errors(z + step * unit)) / step for unit in np.eye(2)])
-        weighted = np.einsum("pct,cd->pdt", J, weight)
-        information = np.einsum("pdt,qdt->pq", weighted, J) + np.eye(2)
-        scores = np.einsum("pdt,dt->pt", weighted, e)
-        z = z + np.clip(np.asarray(np.linalg.solve(information, scores.sum(1)), np.float64), -0.5, 0.5)
-    return z, information, np.stack([scores[:, b].sum(1) for b in blocks], 1)
+def check_length(rows: CountedRows, which: str) -> None:
+    """Raises `InputError` for less than five blocks of 4 s."""
+    blocks = int(rows.rows * rows.dt / _SHORTEST_S)
+    if blocks < _FEWEST:
+        raise InputError(f"{which}: found {blocks} blocks of 4 s of usable driving, needs {_FEWEST} or more")
 
 
-def _horizon(sides: Sequence[_LagAndGain]) -> float:
-    """Length of the rollouts [s], up to `HORIZON_S`, that fits the stretches of both sides: errors grow with it.
-
-    The longest of which both sides hold enough that is whole. A rollout that begins with its stretch is shorter, and of
-    many overrides most would be.
-    """
-    records = [side.record for side in sides]
+def whole_runs(sides: Sequence[CountedRows]) -> tuple[float, list[list[slice]]]:
+    """Length of the free runs [s], up to `HORIZON_S`, and the whole runs of each side: errors grow with the length, so
+    it is the longest of which all sides hold enough."""
+    horizon, each = _HORIZONS[-1], []
     for horizon in _HORIZONS:
-        rows = [sum(block.stop - block.start for block in _whole(record, horizon)) for record in records]
-        if all(count > _WHOLE_SHARE * record.rows for count, record in zip(rows, records, strict=True)):
-            return horizon
-    return min(reached(r, _HORIZONS[-1]) for r in records)
-
-
-def _whole(record: Record, horizon: float) -> list[slice]:
-    """The blocks without the rows that have less than `horizon` [s] of their stretch before them."""
-    found: list[slice] = []
-    for block in blocks_of(record, fewest=FEWEST_BLOCKS):
-        stretch = int(record.starts[np.searchsorted(record.starts, block.start, side="right") - 1])
-        begin = max(block.start, stretch + round(horizon / record.dt))
-        found += [slice(begin, block.stop)] if begin < block.stop else []
-    return found if len(found) >= FEWEST_BLOCKS else []
+        rows = [round(horizon / side.dt) for side in sides]
+        cut = [runs_over(side.stretches, n) for side, n in zip(sides, rows, strict=True)]
+        each = [[run for run in runs if run.stop - run.start == n] for runs, n in zip(cut, rows, strict=True)]
+        if min(map(len, each)) >= _FEWEST:
+            break
+    return horizon, each
 
 
 def _gaps(
-    sides: Sequence[_LagAndGain], simulators: Sequence[GapPlant], horizon: float, *, same: bool
+    sides: Sequence[_LagAndGain],
+    simulators: Sequence[GapPlant],
+    horizon: float,
+    runs: Sequence[Sequence[slice]],
+    *,
+    same: bool,
 ) -> dict[str, Change]:
-    """Rollout errors before and after, by metric; both sides use the same bootstrap draws for the `same` drives."""
+    """Errors of free runs before and after, by metric; the `same` drives have the same bootstrap draws."""
     drawn: list[dict[str, FloatArray]] = []
-    for i, (side, simulator) in enumerate(zip(sides, simulators, strict=True)):
-        rng = np.random.default_rng(0 if same else i)
-        record = side.record
-        errors = record.measured - rolled_out(record, simulator)
-        blocks = _whole(record, horizon) or blocks_of(record, fewest=FEWEST_BLOCKS)
-        squares = block_squares(record, errors, blocks, float(simulator.T_L), horizon)
-        rows = np.array([(b.stop - b.start) * record.group for b in blocks], float)
-        weights = rng.multinomial(len(blocks), np.full(len(blocks), 1 / len(blocks)), size=_DRAWS)
-        weights = np.concatenate([np.ones((1, len(blocks))), weights])
-        drawn.append({name: np.sqrt(weights @ x / (weights @ rows)) for name, x in squares.items()})
+    for i, (side, simulator, own) in enumerate(zip(sides, simulators, runs, strict=True)):
+        record, count = side.rows, len(own)
+        squares = record.squares(record.measured - record.rolled_out(simulator), own, horizon)
+        weights = np.random.default_rng(0 if same else i).multinomial(count, np.full(count, 1 / count), size=_DRAWS)
+        weights = np.concatenate([np.ones((1, count)), weights])
+        rows = (own[0].stop - own[0].start) * record.group
+        drawn.append({name: np.sqrt(weights @ x / (count * rows)) for name, x in squares.items()})
     return {
         name: Change(*(Quantity.of_resampled(x[0], x[1:]) for x in (before, drawn[1][name], drawn[1][name] / before)))
         for name, before in drawn[0].items()
@@ -297,7 +252,6 @@ def _sentence(
     p_value: float,
     simulator: SimulatorChange,
     changed: bool,
-    of_two: DeadTimeTest | None,
     cause: ChangeCause | None,
     *,
     same: bool,
@@ -312,39 +266,11 @@ def _sentence(
         f"{name} {car[name].before.mean:.2f} to {car[name].after.mean:.2f}{unit}"
         for name, unit in (("T_L", " s"), ("K_L", ""))
     )
-    # what all effects were tried for is not said again of two of them
-    named = cause is not None and bool(cause.parts)
-    first = _explanation(numbers, f"p = {p_value:.2g}", changed, of_two, named=named)
+    first = "The car has changed: as GLVD without any effect," if changed else "T_L and K_L alone show no change:"
     words = {
         "closer": "the drives after are closer to the simulator",
         "farther": "the drives after are farther from the simulator",
         "inconclusive": "the simulator's error has not changed measurably",
     }
-    last = (
-        "The drives, or the stretches between overrides, are too short to name a cause." if cause is None else cause.why
-    )
-    return f"{first}; {words[simulator]}. {last}"
-
-
-def _explanation(numbers: str, chance: str, changed: bool, of_two: DeadTimeTest | None, *, named: bool) -> str:
-    """The sentence on lag and gain: they are stated as the explanation only where dead time is none."""
-    if not changed:
-        first = "T_L and K_L alone show no change" if named else "No change of the car is detected"
-        return f"{first}: {numbers} ({chance})"
-    if named:
-        return f"The car has changed: as GLVD without any effect, {numbers} ({chance})"
-    if of_two is None:
-        return f"The car has changed: {numbers} ({chance})"
-    delays = " to ".join(f"{max(q.mean, 0.0):.2f}" for q in (of_two.before, of_two.after))
-    if of_two.explanation == "lag and gain":
-        more = f"that the dead time has changed instead or too has probability {1 - of_two.p_lag_gain:.2g}"
-        return f"The car has changed: {numbers} ({chance}); {more}"
-    if of_two.explanation == "not distinguishable":
-        return (
-            f"The car has changed ({chance}), but these drives cannot distinguish a change of lag and gain ({numbers}) "
-            f"from one of dead time ({delays} s, probability {1 - of_two.p_lag_gain:.2g})"
-        )
-    return (
-        f"The car has changed ({chance}), but lag and gain do not explain it (probability {of_two.p_lag_gain:.2g}): "
-        f"a dead time fitted as well goes from {delays} s, and without one they would be {numbers}"
-    )
+    last = "The drives are too unlike to name a cause." if cause is None else cause.why
+    return f"{first} {numbers} (p = {p_value:.2g}); {words[simulator]}. {last}"

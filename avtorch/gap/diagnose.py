@@ -23,12 +23,11 @@ from avtorch.gap.engine.priors import UNKNOWN_NATS
 from avtorch.gap.engine.sample import sample
 from avtorch.gap.result import sentences
 from avtorch.gap.result.attribution import change_attribution, localise, row_attribution
-from avtorch.gap.result.budget import MATERIAL
+from avtorch.gap.result.budget import MATERIAL, budget_of, families_of
+from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.result.diagnosis import BlackBoxSimulator, Diagnosis
 from avtorch.gap.result.free_form import fitted_form
-from avtorch.gap.result.free_runs import CountedRows
-from avtorch.gap.result.gap_budget import budget_of, families_of, shrinkage_of
-from avtorch.gap.result.gap_size import Simulated, gap_size
+from avtorch.gap.result.gap_size import Simulated, gap_size, shrinkage_of
 from avtorch.gap.result.held_out import held_out_errors
 from avtorch.gap.result.hypotheses import (
     ALIAS_RATIO,
@@ -140,7 +139,7 @@ def diagnose(
     )
     average = renamed(inference.average, random, {kind.name for kind in shown})
     none = inference.base
-    rows = CountedRows.of(inference.data, tuple(each))
+    rows = CountedRows.of(each, inference.data)
     epoch = each[int(rows.log[0])].epoch_s
     names = verdict_names(average)
     weight = best_weight(average, names)

@@ -28,6 +28,10 @@ _UNITS = {
 }
 
 
+RESAMPLES = 400
+"""Of blocks, with replacement."""
+
+
 @dataclass(frozen=True)
 class Quantity:
     """Mean, standard deviation and the central 90 % of a posterior. Raises `InputError` unless finite and in order."""
@@ -72,6 +76,14 @@ class Quantity:
     def to_dict(self) -> dict[str, float]:
         """The quantity as JSON: mean, sd, q05, q95."""
         return of_fields(self)
+
+
+def resampled(x: FloatArray, seed: int) -> FloatArray:
+    """Means (..., draw) over resampled blocks of `x` (..., block); the first draw is the blocks themselves."""
+    blocks = x.shape[-1]
+    pick = np.random.default_rng(seed).integers(0, blocks, (RESAMPLES, blocks))
+    pick[0] = np.arange(blocks)
+    return x[..., pick].mean(-1)
 
 
 def plain(x: Any) -> Any:

@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.engine.priors import FAINT_MAP
-from avtorch.gap.result.budget import HORIZON_S
+from avtorch.gap.result.counted_rows import HORIZON_S
 from avtorch.gap.result.free_form import (
     GAIN_SD,
     SIZES,
@@ -136,7 +136,7 @@ def fit_pedals(logs: LogSource | Sequence[LogSource]) -> PedalFit:
     drive = PedalDrive.of(logs)
     kept, independent = _whitening(drive)
     _, factor = _with_dead_time(drive, FACTOR, independent, kept)
-    runs, edges = factor.car.runs(_LAG[0], cut=True), factor.car.edges
+    runs, edges = factor.car.runs_in_blocks, factor.car.edges
     left = LeftOut.of(runs, edges) if len(runs.of_run) else None
     if left is None:
         raise InputError(f"logs: found {len(edges) - 1} blocks of some seconds that count, needs 3 for a map")
@@ -233,11 +233,8 @@ def car_of(
             out[i:j] = u[i:j] - lag / drive.dt * np.diff(np.append(u[i], after))
         return out
 
-    car = Car(rows, named, _LAG).with_runs(LONGEST_S, _SETTLED_S)
-    car.slope = slope
-    if drive.is_loop:
-        car.steep, car.before_s, car.kept = GAIN_SD, LOOP_BEFORE_S, kept
-    return car
+    car = Car(rows, named, _LAG, slope=slope, longest_s=LONGEST_S, settled_s=_SETTLED_S)
+    return replace(car, steep=GAIN_SD, before_s=LOOP_BEFORE_S, kept=kept) if drive.is_loop else car
 
 
 def _knots(drive: PedalDrive) -> tuple[FloatArray, FloatArray]:
@@ -264,9 +261,8 @@ def _whitening(drive: PedalDrive) -> tuple[float, float]:
     kept, knots, fit = 0.0, _knots(drive), None
     for _ in range(_KEPT_ROUNDS):
         car = car_of(drive, _DEAD_TIMES_S[1], knots, SLOPE_SD, kept)
-        fit = fitted(car, _FIRST, car.zero if fit is None else fit.x, len(car.runs(_LAG[0]).of_run))
-        car.kept = 0.0
-        left, of_run = drive_runs(car, fit.x)[0], fit.runs.of_run
+        fit = fitted(car, _FIRST, car.zero if fit is None else fit.x, len(car.runs.of_run))
+        left, of_run = drive_runs(replace(car, kept=0.0), fit.x)[0], fit.runs.of_run
         now, then = (left[k][of_run[1:] == of_run[:-1]] for k in (slice(1, None), slice(-1)))
         kept = float(np.clip((now * then).sum() / max(float((then**2).sum()), 1e-12), 0.0, 0.99))
     return kept, float(len(of_run))
@@ -316,8 +312,8 @@ def _scored(of: Mapping[str, tuple[Fit, Sizes]], left: LeftOut, independent: flo
     for model, (fit, sizes) in of.items():
         taught = Fit(fit.car, fit.x, cut=True)
         steps = Products(taught, left).steps(Prior(fit.car, sizes), independent)
-        car = fit.car.with_runs(HORIZON_S)
-        runs = car.runs(float(fit.x[-1]), cut=True)
+        car = replace(fit.car, longest_s=HORIZON_S, before_s=None, kept=0.0)
+        runs = car.runs_in_blocks
         block, own = (np.searchsorted(car.edges, first, side="right") for first in (runs.first, taught.runs.counts))
         squares = np.full(len(block), np.nan)
         for is_told, step in zip(left.told[left.way == 0], steps[left.way == 0], strict=True):

@@ -12,7 +12,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.budget import HORIZON_S, LIKELY, UNITS, Axis, Budget, percent
+from avtorch.gap.result.attribution import UNITS, Axis
+from avtorch.gap.result.budget import LIKELY, Budget, percent
+from avtorch.gap.result.counted_rows import HORIZON_S
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.hypotheses import Candidate
 from avtorch.gap.result.traces import Traces

@@ -12,10 +12,9 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.gap import EFFECTS, GapPlant, plant
-from avtorch.gap.drive_record import Record
+from avtorch.gap import EFFECTS, Effect, GapPlant, plant
+from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.result.traces import Traces
-from avtorch.gap.rollout_errors import rms, rolled_out
 from avtorch.io import Log
 
 
@@ -46,7 +45,7 @@ class Trial:
         0.2
     """
 
-    record: Record = field(repr=False)
+    rows: CountedRows = field(repr=False)
     base: GapPlant
     car: GapPlant
 
@@ -61,19 +60,19 @@ class Trial:
         except (OSError, ValueError, KeyError, TypeError) as fault:
             raise InputError(f"{answer / 'diagnosis.json'}: cannot be read ({fault})") from None
         base, repaired = plant([], T_L=lag, K_L=gain, sigma=0.0), answer / "plant.toml"
-        return cls(Record.of(log), base, plant([], baseline=repaired) if repaired.exists() else base)
+        return cls(CountedRows.of(log), base, plant([], baseline=repaired) if repaired.exists() else base)
 
     @property
     def traces(self) -> Traces:
         """What was measured."""
-        measured = self.record.measured
-        return Traces.of(self.record, measured, measured, np.zeros(self.record.rows))
+        measured = self.rows.measured
+        return Traces.of(self.rows, measured, measured, np.zeros(self.rows.rows))
 
     def sizes(self, car: GapPlant) -> dict[str, Size]:
         """What can be moved, by the names of `GapPlant.parameters`."""
         out, values = {}, car.values()
         for key, p in car.parameters().items():
-            if p.reported and p.size == 1 and key in values and values[key].numel() == 1:
+            if p.reported and key in values and values[key].numel() == 1:
                 value = float(values[key])
                 ends = [p.low, p.high, value, 0.6 * value, 1.4 * value, *([] if p.neutral is None else [p.neutral])]
                 known = [x for x in ends if np.isfinite(x)]
@@ -82,19 +81,19 @@ class Trial:
 
     def addable(self) -> list[str]:
         """Effects that the car lacks and a rollout can show."""
-        own, channels = {e.name for e in self.car.effects}, self.record.channels
+        own, channels = {e.name for e in self.car.effects}, self.rows.channels
         return [
             name
             for name, kind in sorted(EFFECTS.items())
             if not (name in own or kind.random or (kind.needs_speed and "speed" not in channels))
             and not (kind.place == "sensor" and "accel" not in channels)
-            and all(p.size == 1 for p in kind().coordinates())  # a road's profile is fitted, not set
+            and kind.drawn is Effect.drawn  # a road's profile is fitted, not set
             and any(key.startswith(f"{name}.") for key in self.sizes(self.with_effect(self.car, name)))
         ]
 
     def with_effect(self, car: GapPlant, name: str) -> GapPlant:
         """`car` with one more effect, of typical size."""
-        return plant([EFFECTS[name]], baseline=car).prepared(*self.record.drives, fitted=[name])
+        return plant(plant([EFFECTS[name]]).prepared(*self.rows.drives).effects, baseline=car)
 
     def rollout(
         self, car: GapPlant, on: Collection[str], values: Mapping[str, float]
@@ -104,8 +103,7 @@ class Trial:
         left = GapPlant([e for e in car.effects if e.name in on], T_L=car.T_L, K_L=car.K_L, sigma=0.0)
         there = left.parameters()
         left = left.with_values({key: x for key, x in values.items() if key in there})
-        lines = rolled_out(self.record, left)
+        lines = self.rows.rolled_out(left)
         if not np.isfinite(lines).all():
             raise InputError("the simulator diverges with these sizes; needs others")
-        errors = rms(self.record, self.record.measured - lines, float(left.T_L))
-        return self.traces.begun_anew(lines.mean(-1)), errors
+        return self.traces.begun_anew(lines.mean(-1)), self.rows.rms(self.rows.measured - lines)

@@ -11,9 +11,10 @@ from avtorch.gap.engine.family import FORMS
 from avtorch.gap.quantity import Quantity, unit_of, words_of
 from avtorch.gap.result import budget as budget_parts
 from avtorch.gap.result import sentences
-from avtorch.gap.result.budget import UNITS, Budget
+from avtorch.gap.result.attribution import UNITS
+from avtorch.gap.result.budget import Budget
 from avtorch.gap.result.diagnosis import Diagnosis
-from avtorch.gap.result.gap_budget import Shrinkage
+from avtorch.gap.result.gap_size import Shrinkage
 from avtorch.gap.result.manoeuvres import Manoeuvre
 from avtorch.report.table import Table
 

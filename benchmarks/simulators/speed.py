@@ -20,7 +20,7 @@ from pythonfmu.builder import FmuBuilder  # pyright: ignore[reportMissingImports
 
 from avtorch import Leader, simulate
 from avtorch.gap import plant
-from avtorch.gap.effects import SensorBias
+from avtorch.gap.effects.sensor_bias import SensorBias
 
 RATE_HZ = 100
 

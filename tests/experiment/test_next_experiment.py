@@ -14,7 +14,12 @@ from avtorch.errors import InputError
 from avtorch.experiment import Limits, ManoeuvrePrediction, information, library, next_experiment, write_table
 from avtorch.experiment.prediction import responses
 from avtorch.gap import Effect, plant
-from avtorch.gap.effects import AerodynamicDrag, ConstantResistance, DeadBand, GainChange, RoadGrade, SensorBias
+from avtorch.gap.effects.aerodynamic_drag import AerodynamicDrag
+from avtorch.gap.effects.constant_resistance import ConstantResistance
+from avtorch.gap.effects.dead_band import DeadBand
+from avtorch.gap.effects.gain_change import GainChange
+from avtorch.gap.effects.road_grade import RoadGrade
+from avtorch.gap.effects.sensor_bias import SensorBias
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance

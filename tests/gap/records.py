@@ -10,7 +10,6 @@ import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.gap import GapPlant, SimulatorInput, plant
-from avtorch.gap.drive_record import Record
 from avtorch.io import Log
 
 BOTH = ("accel", "speed")
@@ -102,8 +101,3 @@ def covariance(sd: float, lag: float, time: FloatArray) -> FloatArray:
     )
     both = 2 * lag * np.minimum(t, s) - lag**2 * (1 - np.exp(-t / lag) - np.exp(-s / lag) + between)
     return sd**2 * np.block([[between, lag * mixed], [lag * mixed.T, both]])
-
-
-def record_of(seconds: float, **options: object) -> Record:
-    """A record of a drive with `seconds` of usable rows, at 20 Hz by default."""
-    return Record.of(log_of(seconds=seconds + 2.0, **options))  # type: ignore[arg-type]

@@ -7,7 +7,8 @@ import torch
 from avtorch import diagnose
 from avtorch.gap import DeadTime
 from avtorch.gap.compare import compare
-from avtorch.gap.effects import SpeedDependentGain, SpeedDependentLag
+from avtorch.gap.effects.speed_dependent_gain import SpeedDependentGain
+from avtorch.gap.effects.speed_dependent_lag import SpeedDependentLag
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.simulator.simulator_input import SimulatorInput
 from avtorch.io import Log

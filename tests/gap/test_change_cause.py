@@ -20,8 +20,14 @@ from avtorch.gap.engine.joint import JointModel, block_scores, of_car, of_effect
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.cause_of_change import _of_effect, cause_of_change
-from avtorch.gap.result.comparison import ChangeCause, ChangePart, Comparison, detectable_text
+from avtorch.gap.result.comparison import (
+    ChangeCause,
+    ChangePart,
+    Comparison,
+    _of_effect,
+    cause_of_change,
+    detectable_text,
+)
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.io import Log
 from avtorch.report.comparison import comparison_html, comparison_tables

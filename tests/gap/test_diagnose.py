@@ -9,7 +9,7 @@ import pytest
 import avtorch
 from avtorch import diagnose
 from avtorch.errors import InputError
-from avtorch.gap.effects import SensorBias
+from avtorch.gap.effects.sensor_bias import SensorBias
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log
 from benchmarks.blindtest import draw_case

@@ -14,7 +14,7 @@ import torch
 import avtorch
 from avtorch.errors import InputError
 from avtorch.gap import AerodynamicDrag, RoadGrade, SensorLag, SimulatorInput, plant
-from avtorch.gap.drive_record import Record
+from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.io import Log
 from benchmarks.blindtest.car import Car
 from benchmarks.blindtest.drives import DrivePlan as Plan
@@ -66,9 +66,6 @@ def test_a_drive_with_an_accelerometer_shows_the_slope_in_the_speed_alone() -> N
 def test_the_kind_travels_with_the_log() -> None:
     log = replace(log_of(seconds=20.0, rate_hz=40), accel_kind="specific-force")
     assert log[0:100].accel_kind == "specific-force"
-    record = Record.of(log)
-    assert record.drives[0].specific_force
-    assert all(d.specific_force for d in record.drives)
-    assert SimulatorInput.from_log(log).specific_force
+    assert all(d.specific_force for d in CountedRows.of(log).drives)
     with pytest.raises(InputError, match="different kinds of accel"):
-        Record.of([log, replace(log, accel_kind="kinematic")])
+        CountedRows.of([log, replace(log, accel_kind="kinematic")])

@@ -10,7 +10,7 @@ import pytest
 import avtorch
 from avtorch.errors import InputError
 from avtorch.gap import DeadTime, GapPlant, Gust, SensorBias, plant
-from avtorch.gap.drive_record import Record
+from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.io import Log
 from avtorch.remedy import Trial
 
@@ -24,7 +24,7 @@ def log() -> Log:
 
 @pytest.fixture(scope="module")
 def trial(log: Log) -> Trial:
-    return Trial(Record.of(log), plant([], T_L=0.6, K_L=1.0, sigma=0.0), CAR)
+    return Trial(CountedRows.of(log), plant([], T_L=0.6, K_L=1.0, sigma=0.0), CAR)
 
 
 def test_the_car_itself_leaves_nothing(trial: Trial) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -33,12 +32,9 @@ class ConstantResistance(Effect):
     name = "constant_resistance"
     place = "body"
     meaning = "the same deceleration at every speed"
+    words = "the car is slowed by {resistance_mps2:.2g} m/s² at every speed"
     equation = "-r while moving"
     parameters = (Parameter("resistance_mps2", "m/s²", 0.0, 0.05, 0.3, possible=(0.0, 3.5)),)
-
-    @classmethod
-    def in_words(cls, values: Mapping[str, float]) -> str:
-        return f"the car is slowed by {values['resistance_mps2']:.2g} m/s² at every speed"
 
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         force = -tensor(self.resistance_mps2)

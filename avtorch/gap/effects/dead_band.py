@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -34,12 +33,9 @@ class DeadBand(Effect):
     place = "command"
     order = 2
     meaning = "commands within a band do nothing, larger ones are reduced by its half width"
+    words = "commands of less than {half_width_mps2:.2g} m/s² do nothing"
     equation = "sign(u) max(|u| - delta, 0)"
     parameters = (Parameter("half_width_mps2", "m/s²", 0.0, 0.02, 0.3, possible=(0.0, 1.0)),)
-
-    @classmethod
-    def in_words(cls, values: Mapping[str, float]) -> str:
-        return f"commands of less than {values['half_width_mps2']:.2g} m/s² do nothing"
 
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         width = tensor(self.half_width_mps2)

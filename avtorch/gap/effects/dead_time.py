@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,12 +40,9 @@ class DeadTime(Effect):
     order = 9
     shift = "delay_s"
     meaning = "the command acts after a delay"
+    words = "commands act {delay_s:.2g} s late"
     equation = "u(t - tau)"
     parameters = (Parameter("delay_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.5)),)
-
-    @classmethod
-    def in_words(cls, values: Mapping[str, float]) -> str:
-        return f"commands act {values['delay_s']:.2g} s late"
 
     def start(self, x: Tensor, row: EffectContext) -> list[Tensor]:
         return [x]

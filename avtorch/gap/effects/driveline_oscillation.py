@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,6 +46,7 @@ class DrivelineOscillation(Effect):
     name = "driveline_oscillation"
     place = "body"
     meaning = "changes of the drive torque make the driveline ring"
+    words = "the driveline rings at {frequency_hz:.2g} Hz"
     equation = "amplitude y,  y'' + 2 zeta omega y' + omega² y = omega da/dt"
     parameters = (
         Parameter("frequency_hz", "Hz", None, 1.0, 5.0, possible=(0.3, 15.0)),
@@ -54,10 +54,6 @@ class DrivelineOscillation(Effect):
         Parameter("quadrature", "-", 0.0, -0.5, 0.5, "real", reported=False, possible=(-1.0, 1.0)),
         Parameter("mode_damping", "-", None, 0.03, 0.2, reported=False, possible=(0.005, 0.35)),
     )
-
-    @classmethod
-    def in_words(cls, values: Mapping[str, float]) -> str:
-        return f"the driveline rings at {values['frequency_hz']:.2g} Hz"
 
     def report(self, T_L: Tensor) -> dict[str, Tensor]:
         amplitude = torch.hypot(tensor(self.amplitude), tensor(self.quadrature))

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from avtorch.errors import InputError
 from avtorch.gap.simulator.effect import Domain, Effect, EffectContext, Parameter, register
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -20,8 +18,7 @@ from avtorch.vehicle.arguments import Number, tensor
 class GainChange(Effect):
     """`K_L` times `gain_ratio` from `change_s` on, reached over `ramp_s` (near 0: a step); neutral at ratio 1.
 
-    A row takes the mean over its step, so the response is differentiable in the change time. The prior of that time is
-    uniform over the drive, `earliest_s … latest_s`; raises `InputError` unless the former is less.
+    A row takes the mean over its step, so the response is differentiable in the change time.
 
     Possible are ratios up to five either way: the payload of a truck, brake fade. The change time is unrestricted.
 
@@ -38,8 +35,6 @@ class GainChange(Effect):
     gain_ratio: Number = 0.75
     change_s: Number = 30.0
     ramp_s: Number = 0.0
-    earliest_s: float = 0.0
-    latest_s: float = 60.0
 
     name = "gain_change"
     place = "actuator"
@@ -49,13 +44,12 @@ class GainChange(Effect):
     of_the_drive = True
     parameters = (
         Parameter("gain_ratio", "-", 1.0, 0.65, 1.4, possible=(0.2, 5.0)),
-        Parameter("change_s", "s", None, 0.0, 60.0, "interval", possible=(-math.inf, math.inf)),
+        Parameter("change_s", "s", None, 0.0, 60.0, "real", possible=(-math.inf, math.inf)),
         Parameter("ramp_s", "s", None, 0.5, 60.0, reported=False),
     )
     settings = (
         Domain("ramp_s", 0.0, 1e6, "s"),
-        Domain("earliest_s", -1e12, 1e12, "s"),
-        Domain("latest_s", -1e12, 1e12, "s"),
+        Domain("change_s", -1e12, 1e12, "s"),
     )
 
     @classmethod
@@ -63,26 +57,11 @@ class GainChange(Effect):
         ratio = values["gain_ratio"]
         return f"the gain {'falls' if ratio < 1 else 'rises'} to {100 * ratio:.0f} % during the drive"
 
-    def __post_init__(self) -> None:
-        if not self.earliest_s < self.latest_s:
-            raise InputError(
-                f"gain_change: found earliest_s {self.earliest_s:g} and latest_s {self.latest_s:g}, needs the earliest "
-                "before the latest"
-            )
-
     def apply(self, x: Tensor, row: EffectContext) -> tuple[Tensor, float]:
         ramp = tensor(self.ramp_s).clamp_min(1e-6)
         since = row.time - tensor(self.change_s)
         share = (_area(since + row.dt, ramp) - _area(since, ramp)) / row.dt
         return 1 + (tensor(self.gain_ratio) - 1) * share, 1.0
-
-    def coordinates(self) -> tuple[Parameter, ...]:
-        ratio, change, ramp = self.parameters
-        return ratio, replace(change, low=self.earliest_s, high=self.latest_s), ramp
-
-    def prepared(self, time: Tensor, speed: Tensor | None, position: Tensor | None) -> Self:
-        first, last = float(time[0]), float(time[-1])
-        return replace(self, earliest_s=first, latest_s=max(last, math.nextafter(first, math.inf)))
 
 
 def _area(since: Tensor, ramp: Tensor) -> Tensor:

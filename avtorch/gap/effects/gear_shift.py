@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,18 +16,15 @@ from avtorch.vehicle.arguments import Number, tensor
 _NEVER = -1e9
 
 
-_SHIFTS = 6
-
-
 @register
 @dataclass(frozen=True)
 class GearShift(Effect):
     """Where the speed rises through one of `speeds` [m/s], a positive command loses the share `depth` for `duration_s`.
 
-    Neutral at depth 0. Without `speeds`, they are those of a gearbox with constant ratio: `first_mps`, each next one
-    `gear_ratio` times the previous. Once the speed has fallen `rearm_mps` below a shift speed, the gear has changed
-    back, without an interruption. The crossing is interpolated between rows, and a row loses drive for the part of
-    its step that lies in the interruption, so the response is differentiable in duration and speeds.
+    Neutral at depth 0. By default the shift speeds are those of a gearbox of constant ratio. Once the speed has fallen
+    `rearm_mps` below a shift speed, the gear has changed back, without an interruption. The crossing is interpolated
+    between rows, and a row loses drive for the part of its step that lies in the interruption, so the response is
+    differentiable in duration and speeds.
 
     Possible are interruptions of 0.02 s (dual clutch) to 2.5 s (automated gearbox of a truck).
 
@@ -44,42 +40,35 @@ class GearShift(Effect):
 
     depth: Number = 0.7
     duration_s: Number = 0.25
-    first_mps: Number = 4.5
-    gear_ratio: Number = 1.5
-    speeds: tuple[float, ...] | None = None
+    speeds: tuple[float, ...] = (4.5, 6.75, 10.1, 15.2, 22.8, 34.2)
     rearm_mps: float = 1.5
 
     name = "gear_shift"
     place = "actuator"
     needs_speed = True
     meaning = "upshifts at certain speeds interrupt the drive torque"
+    words = "upshifts interrupt the drive torque for {duration_s:.2g} s"
     equation = "K_L (1 - depth) for duration after each upshift, where u > 0"
     of_the_drive = True
     parameters = (
         Parameter("depth", "-", 0.0, 0.3, 0.95, "unit"),
         Parameter("duration_s", "s", None, 0.1, 0.6, possible=(0.02, 2.5)),
-        Parameter("first_mps", "m/s", None, 3.0, 7.0, reported=False),
-        Parameter("gear_ratio", "-", None, 1.3, 1.8, reported=False),
     )
     settings = (
         Domain("speeds", 0.1, 150.0, "m/s", most=16, rising=True),
         Domain("rearm_mps", 0.0, 20.0, "m/s"),
     )
 
-    @classmethod
-    def in_words(cls, values: Mapping[str, float]) -> str:
-        return f"upshifts interrupt the drive torque for {values['duration_s']:.2g} s"
-
     def start(self, x: Tensor, row: EffectContext) -> list[tuple[Tensor, Tensor, Tensor]]:
         """State of each shift: speed one row ago, whether above, start of the last interruption."""
         v = row.speed
-        return [(v, v > s, torch.full_like(v, _NEVER)) for s in self._thresholds()]
+        return [(v, v > s, torch.full_like(v, _NEVER)) for s in map(tensor, self.speeds)]
 
     def advance(
         self, x: Tensor, row: EffectContext, state: list[tuple[Tensor, Tensor, Tensor]]
     ) -> tuple[tuple[Tensor, float], list[tuple[Tensor, Tensor, Tensor]]]:
         v, lost, after = row.speed, torch.zeros(()), []
-        for s, (v_before, above, since) in zip(self._thresholds(), state, strict=True):
+        for s, (v_before, above, since) in zip(map(tensor, self.speeds), state, strict=True):
             up = ~above & (v > s)
             since = torch.where(up, self._crossing(v_before, v, s, row.time, row.dt), since)
             above = (above | up) & (v > s - self.rearm_mps)
@@ -89,7 +78,7 @@ class GearShift(Effect):
 
     def over(self, x: Tensor, row: EffectContext) -> tuple[Tensor, float]:
         v, lost = row.speed, torch.zeros(())
-        for s in self._thresholds():
+        for s in map(tensor, self.speeds):
             shape = np.broadcast_shapes(v.shape, s.shape)
             columns = v.expand(shape).reshape(-1, shape[-1]).contiguous().numpy()
             levels = s.detach().expand(*shape[:-1], 1).reshape(-1).contiguous().numpy()
@@ -101,11 +90,6 @@ class GearShift(Effect):
             since = torch.where(last > 0, self._crossing(before, after, s, time, dt), _NEVER)
             lost = torch.maximum(lost, _covered(since, tensor(self.duration_s), row.time, row.dt))
         return self._factor(lost, x), 1.0
-
-    def _thresholds(self) -> list[Tensor]:
-        if self.speeds is not None:
-            return [tensor(s) for s in self.speeds]
-        return [tensor(self.first_mps) * tensor(self.gear_ratio) ** i for i in range(_SHIFTS)]
 
     @staticmethod
     def _crossing(before: Tensor, v: Tensor, s: Tensor, time: Tensor, dt: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,15 +39,12 @@ class Gust(Effect):
     name = "gust"
     place = "body"
     meaning = "wind and road push the car at random, for seconds"
+    words = "wind and road push the car at random by {sd_mps2:.2g} m/s²"
     equation = "df = -f / tau dt + sd sqrt(2 / tau) dW"
     parameters = (
         Parameter("sd_mps2", "m/s²", 0.0, 0.1, 0.4, possible=(0.0, 0.6)),
         Parameter("time_constant_s", "s", None, 1.0, 5.0, possible=(0.2, 60.0)),
     )
-
-    @classmethod
-    def in_words(cls, values: Mapping[str, float]) -> str:
-        return f"wind and road push the car at random by {values['sd_mps2']:.2g} m/s²"
 
     def advance(self, x: Tensor, row: EffectContext, state: Any) -> tuple[Tensor, Any]:
         if row.normal is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,12 +40,9 @@ class HandOver(Effect):
     place = "command"
     order = 4
     meaning = "nothing acts for a while when the command changes between drive and brake"
+    words = "nothing acts for {pause_s:.2g} s between drive and brake"
     equation = "0 for tau after sign(u) has changed, then u"
     parameters = (Parameter("pause_s", "s", 0.0, 0.1, 0.8, possible=(0.0, 2.0)),)
-
-    @classmethod
-    def in_words(cls, values: Mapping[str, float]) -> str:
-        return f"nothing acts for {values['pause_s']:.2g} s between drive and brake"
 
     def start(self, x: Tensor, row: EffectContext) -> Any:
         return torch.sign(x), torch.full_like(x, _NEVER)

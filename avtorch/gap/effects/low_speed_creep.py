@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -40,12 +39,9 @@ class LowSpeedCreep(Effect):
     place = "body"
     needs_speed = True
     meaning = "the car is pushed forward at walking speed"
+    words = "the car is pushed forward by {creep_mps2:.2g} m/s² at walking speed"
     equation = "creep / (1 + exp((v - 3) / 0.5))"
     parameters = (Parameter("creep_mps2", "m/s²", 0.0, 0.1, 0.5, possible=(0.0, 1.5)),)
-
-    @classmethod
-    def in_words(cls, values: Mapping[str, float]) -> str:
-        return f"the car is pushed forward by {values['creep_mps2']:.2g} m/s² at walking speed"
 
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         return tensor(self.creep_mps2) * torch.sigmoid((_FADES_AT - row.speed) / _FADES_OVER)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,7 +22,7 @@ class RoadGrade(Effect):
     """`-g sin(slope(position))`; the grade is a Gaussian process over position of RMS `grade_rms`; neutral at 0.
 
     Its correlation (Matern 3/2) has the length `smooth_m` [m]. It is expanded in cubic B-splines, one every `knot_m`
-    [m]; `profile` (..., knots) holds their coefficients, with independent standard normal priors (the correlation is
+    [m]; `profile` (knots,) holds their coefficients, with independent standard normal priors (the correlation is
     included in the basis). The response is linear in them as far as the sine is, so a likelihood can integrate them out
     by the `columns`. Where `profile` is None the grade is 0, or drawn where drives are sampled.
 
@@ -69,11 +68,9 @@ class RoadGrade(Effect):
         position = row.position
         if self.profile is None:
             return torch.zeros_like(position)
-        slope = tensor(self.grade_rms) * _spline(position, self._coefficients(), self.knot_m, row.whole)
+        lower = _lower(len(self.profile), self.knot_m, self.smooth_m)
+        slope = tensor(self.grade_rms) * _spline(position, lower @ tensor(self.profile), self.knot_m)
         return -GRAVITY * slope * torch.rsqrt(1 + slope * slope)  # sin(atan(slope)), at a third of its cost
-
-    def coordinates(self) -> tuple[Parameter, ...]:
-        return *self.parameters, Parameter("profile", "-", None, -1.2816, 1.2816, "real", False, self.knots)
 
     def prepared(self, time: Tensor, speed: Tensor | None, position: Tensor | None) -> Self:
         if position is None:
@@ -88,31 +85,17 @@ class RoadGrade(Effect):
     def columns(self, position: Tensor) -> Tensor:
         """Acceleration (time, knot) per unit of each coefficient at `grade_rms` 1, `position` (time,) [m]."""
         lower = _lower(self.knots, self.knot_m, self.smooth_m)
-        return -GRAVITY * _spline(position, lower.T, self.knot_m, True).movedim(0, -1)
-
-    def _coefficients(self) -> Tensor:
-        profile = tensor(self.profile)
-        return profile @ _lower(profile.shape[-1], self.knot_m, self.smooth_m).T
+        return -GRAVITY * torch.stack([_spline(position, column, self.knot_m) for column in lower.T], -1)
 
 
-def _spline(position: Tensor, coefficients: Tensor, knot: float, whole: bool) -> Tensor:
-    """Cubic B-spline with `coefficients` (..., knot) at `position`: (..., time), or (...) where not `whole`."""
+def _spline(position: Tensor, coefficients: Tensor, knot: float) -> Tensor:
+    """Cubic B-spline with `coefficients` (knot,) at `position` (...)."""
     at = position / knot
-    cell = at.detach().floor().clamp(0, coefficients.shape[-1] - 4)
+    cell = at.detach().floor().clamp(0, len(coefficients) - 4)
     t = at - cell
     weights = ((1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3)
-    total = torch.zeros((), dtype=position.dtype)
-    for j, weight in enumerate(weights):
-        index = cell.long() + j
-        if coefficients.dim() == 1:
-            value = coefficients[index]
-        else:
-            index = index if whole else index[..., None]
-            shape = np.broadcast_shapes(index.shape[:-1], coefficients.shape[:-1])
-            value = coefficients.expand(*shape, -1).gather(-1, index.expand(*shape, -1))
-            value = value if whole else value[..., 0]
-        total = total + weight / 6 * value
-    return total
+    values = (coefficients[cell.long() + j] for j in range(4))
+    return torch.stack([weight / 6 * value for weight, value in zip(weights, values, strict=True)]).sum(0)
 
 
 @lru_cache(maxsize=16)

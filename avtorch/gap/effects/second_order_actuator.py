@@ -50,7 +50,7 @@ class SecondOrderActuator(Effect):
     equation = "a'' = omega² (K u - a) - 2 zeta omega a'"
     parameters = (
         Parameter("inverse_frequency_s", "s", 0.0, 1 / 12, 1 / 3, reported=False),
-        Parameter("lag_ratio", "-", 1.0, 0.65, 1 / 0.65, reported=False, of_onset=True),
+        Parameter("lag_ratio", "-", 1.0, 0.65, 1 / 0.65, reported=False),
     )
     derived = (
         Parameter("natural_frequency_radps", "rad/s", None, 3.0, 12.0, possible=(0.5, 60.0)),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,12 +37,9 @@ class SensorLag(Effect):
     name = "sensor_lag"
     place = "sensor"
     meaning = "the accelerometer lags the car's acceleration"
+    words = "the accelerometer lags by {lag_s:.2g} s"
     equation = "s' = (a - s) / lag"
     parameters = (Parameter("lag_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.0)),)
-
-    @classmethod
-    def in_words(cls, values: Mapping[str, float]) -> str:
-        return f"the accelerometer lags by {values['lag_s']:.2g} s"
 
     def start(self, x: Tensor, row: EffectContext) -> Any:
         return x, x, None

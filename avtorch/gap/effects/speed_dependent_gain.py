@@ -13,10 +13,9 @@ from avtorch.vehicle.arguments import Number, tensor
 
 
 class SlopeOverSpeed(Effect):
-    """A factor that is 1 at `pivot` [-] times `mean_speed` [m/s], which is taken from a drive."""
+    """A factor that is 1 at `mean_speed` [m/s], which is taken from a drive."""
 
     mean_speed: Number
-    pivot: Number
 
     place = "actuator"
     needs_speed = True
@@ -24,8 +23,7 @@ class SlopeOverSpeed(Effect):
 
     def _factor(self, slope: Number, row: EffectContext, least: float) -> Tensor:
         """At least `least`, outside a drive's range of speeds."""
-        away = row.speed / (tensor(self.mean_speed) * tensor(self.pivot)) - 1
-        return (1 + tensor(slope) * away).clamp_min(least)
+        return (1 + tensor(slope) * (row.speed / tensor(self.mean_speed) - 1)).clamp_min(least)
 
     def prepared(self, time: Tensor, speed: Tensor | None, position: Tensor | None) -> Self:
         if speed is None:
@@ -38,9 +36,6 @@ class SlopeOverSpeed(Effect):
 @dataclass(frozen=True)
 class SpeedDependentGain(SlopeOverSpeed):
     """`K_L (1 + gain_slope (v - v_mean) / v_mean)`; neutral at 0. `mean_speed` [m/s] is taken from a drive.
-
-    `pivot` [-]: the speed, relative to the mean one, at which the gain is unchanged. It only rescales K_L if the effect
-    has no onset, and is then 1.
 
     Possible up to 2 either way, where the gain vanishes at half or at one and a half times the mean speed.
 
@@ -57,15 +52,11 @@ class SpeedDependentGain(SlopeOverSpeed):
 
     gain_slope: Number = 0.3
     mean_speed: Number = 15.0
-    pivot: Number = 1.0
 
     name = "speed_dependent_gain"
     meaning = "the realised share of the command depends on speed"
     equation = "K_L (1 + slope (v - v_mean) / v_mean)"
-    parameters = (
-        Parameter("gain_slope", "-", 0.0, -0.4, 0.4, "real", possible=(-2.0, 2.0)),
-        Parameter("pivot", "-", None, 0.6, 1 / 0.6, reported=False, of_onset=True),
-    )
+    parameters = (Parameter("gain_slope", "-", 0.0, -0.4, 0.4, "real", possible=(-2.0, 2.0)),)
 
     @classmethod
     def in_words(cls, values: Mapping[str, float]) -> str:

@@ -17,9 +17,6 @@ from avtorch.vehicle.arguments import Number
 class SpeedDependentLag(SlopeOverSpeed):
     """`T_L (1 + lag_slope (v - v_mean) / v_mean)`; neutral at 0. `mean_speed` [m/s] is taken from a drive.
 
-    `pivot` [-]: the speed, relative to the mean one, at which the lag is unchanged. It only rescales T_L if the effect
-    has no onset, and is then 1.
-
     Possible up to 2 either way, where the lag vanishes at half or at one and a half times the mean speed.
 
     Example:
@@ -35,15 +32,11 @@ class SpeedDependentLag(SlopeOverSpeed):
 
     lag_slope: Number = 0.5
     mean_speed: Number = 15.0
-    pivot: Number = 1.0
 
     name = "speed_dependent_lag"
     meaning = "the actuator is slower at some speeds"
     equation = "T_L (1 + slope (v - v_mean) / v_mean)"
-    parameters = (
-        Parameter("lag_slope", "-", 0.0, -0.7, 0.7, "real", possible=(-2.0, 2.0)),
-        Parameter("pivot", "-", None, 0.6, 1 / 0.6, reported=False, of_onset=True),
-    )
+    parameters = (Parameter("lag_slope", "-", 0.0, -0.7, 0.7, "real", possible=(-2.0, 2.0)),)
 
     @classmethod
     def in_words(cls, values: Mapping[str, float]) -> str:

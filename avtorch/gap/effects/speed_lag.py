@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from avtorch.gap.effects.sensor_lag import SensorLag
@@ -34,9 +33,6 @@ class SpeedSensorLag(SensorLag):
     reading = "speed"
     needs_speed = True
     meaning = "the measured speed lags the car's"
+    words = "the measured speed lags by {lag_s:.2g} s"
     equation = "s' = (v - s) / lag"
     parameters = (Parameter("lag_s", "s", 0.0, 0.25, 0.8, possible=(0.0, 2.0)),)
-
-    @classmethod
-    def in_words(cls, values: Mapping[str, float]) -> str:
-        return f"the measured speed lags by {values['lag_s']:.2g} s"

@@ -181,20 +181,6 @@ def scatter_of(model: JointModel, fit: JointFit, change: Change) -> Scatter:
     return Scatter(float(likelihood[at, at]), float(blocks[at, at]), float(drift[at]))
 
 
-def lag_or_dead_time(model: JointModel) -> tuple[JointFit, float, float]:
-    """Probabilities that lag and gain alone have changed, and that the dead time alone has; the fit with all three."""
-    lag, gain, delay = map(of_car, ("T_L", "K_L", "dead_time"))
-    one = [model.with_change(model.start, change) for change in (lag, gain, delay)]
-    two = model.with_change(one[0], gain)
-    three = model.with_change(two, delay)
-    fits = [one[0], one[1], two, one[2], model.with_change(one[0], delay), model.with_change(one[1], delay), three]
-    best = max(fits, key=lambda f: f.evidence)
-    temper = min(scatter_of(model, best, change).temper for change in best.changes)
-    logs = np.array([temper * f.evidence - TEMPER * EFFECT_NATS * len(f.changes) for f in fits])
-    p = np.exp(logs - log_sum(logs))
-    return three, float(p[:3].sum()), float(p[3])
-
-
 def _key(fit: JointFit) -> frozenset[Key]:
     return frozenset(c.key for c in fit.changes)
 

@@ -14,7 +14,6 @@ from typing import Literal
 
 import numpy as np
 
-import avtorch.gap.effects  # noqa: F401 - fills the table
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.priors import FAINT_OF_RANGE, SCALE_OF_RANGE
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
@@ -281,7 +280,7 @@ def adopt(kind: type[Effect]) -> EngineEffect:
     known = EFFECTS.get(kind.name)
     if known is not None and (known.kind is kind or (known.kind is None and TABLE.get(kind.name) is kind)):
         return known
-    coordinates = tuple(_own(kind, p) for p in kind.parameters if not p.of_onset and p.size == 1)
+    coordinates = tuple(_own(kind, p) for p in kind.parameters)
     for c in coordinates:
         INDEX.setdefault(c.name, len(INDEX))
         COORDINATES[c.name] = c

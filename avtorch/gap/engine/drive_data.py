@@ -22,11 +22,10 @@ from scipy.ndimage import gaussian_filter1d
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
-from avtorch.gap.drive_record import same_kind
 from avtorch.gap.engine.compiled_plant import GRID_S
 from avtorch.gap.engine.priors import BAND_RATIO, CLAIM_HZ, FRAME_S, SLOW_HZ, WARM_S
 from avtorch.io import Log
-from avtorch.io.log import AccelKind
+from avtorch.io.log import AccelKind, no_command
 
 UNKNOWN_SPEED_MPS = 15.0
 """What effects read where no speed was measured [m/s]."""
@@ -136,7 +135,7 @@ class DriveData:
         no stretch of driving is long enough for two frames.
         """
         each = [logs] if isinstance(logs, Log) else list(logs)
-        same_kind(each)
+        _same_kind(each)
         rate = min(log.rate_hz for log in each)
         group = max(1, int(1.02 * rate / _MOST_HZ))
         columns: dict[str, list[Any]] = {
@@ -455,6 +454,24 @@ class DriveData:
             return float(self.accel[row : row + w].mean())
         v, t = self.smooth_speed, self.time
         return float((v[row + w] - v[row]) / (t[row + w] - t[row]))
+
+
+def _same_kind(logs: Sequence[Log]) -> None:
+    """Raises `InputError` for logs without `accel_cmd`, or with different channels, rates or kinds of `accel`."""
+    if not logs:
+        raise InputError("logs: none given, needs one or more")
+    names = ", ".join(dict.fromkeys(log.name for log in logs))
+    for log in logs:
+        if log.accel_cmd is None:
+            raise no_command(log, ", which the diagnosis needs")
+    if len({(log.accel is not None, log.speed is not None) for log in logs}) > 1:
+        raise InputError(f"logs: {names} have different channels; needs accel, speed or both in all")
+    if len({log.accel_kind for log in logs}) > 1:
+        raise InputError(f"logs: {names} have different kinds of accel; needs one in all")
+    rates = [log.rate_hz for log in logs]
+    if max(rates) > 1.02 * min(rates):
+        given = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in logs)
+        raise InputError(f"logs: found rates of {given}; needs one rate in all, or one diagnosis each")
 
 
 def _stretches(log: Log) -> list[slice]:

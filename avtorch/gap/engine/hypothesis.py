@@ -354,4 +354,5 @@ def drives_of(h: Hypothesis) -> Iterator[SimulatorInput]:
     for i, j in pairwise([*np.flatnonzero(grid.starts).tolist(), len(grid.time)]):
         speed = None if h.data.speed is None else torch.as_tensor(grid.speed[i:j])
         time, sent = torch.as_tensor(grid.time[i:j]), torch.as_tensor(command[i:j])
-        yield SimulatorInput(time, sent, speed, float(grid.accel0[i]), h.data.accel_kind == "specific-force")
+        felt, place = h.data.accel_kind == "specific-force", float(h.data.position[grid.row[i]])
+        yield SimulatorInput(time, sent, speed, float(grid.accel0[i]), felt, place)

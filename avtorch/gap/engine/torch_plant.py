@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from avtorch.arrays import FloatArray, IntArray
-from avtorch.gap.effects import DrivelineOscillation
+from avtorch.gap.effects.driveline_oscillation import DrivelineOscillation
 from avtorch.gap.engine.compiled_plant import _FREE_DAMPING
 from avtorch.gap.engine.coordinates import EFFECTS, INDEX, NEUTRAL, Coordinate, base_name
 from avtorch.gap.engine.drive_data import UNKNOWN_SPEED_MPS, DriveData, filtered
@@ -175,7 +175,7 @@ class TorchPlant:
             zero = torch.zeros(1, dtype=torch.float64)
             return DrivelineOscillation(frequency, zero, 2 * np.pi * frequency * pole, zero + _FREE_DAMPING)
         effect = table_effect(self.hypothesis, name)
-        neutral = {p.name: p.neutral for p in effect.coordinates() if p.neutral is not None}
+        neutral = {p.name: p.neutral for p in effect.parameters if p.neutral is not None}
         neutral = {k: min(max(x, -_NO_LIMIT), _NO_LIMIT) for k, x in neutral.items()}
         own = {c.parameter: own_value(c, z[c.name])[..., None] for c in coordinates}
         if first and effect.name not in _FILLING and effect.own_onset is None:

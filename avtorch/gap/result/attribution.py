@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 from scipy.signal import lfilter
@@ -23,8 +24,7 @@ from avtorch.gap.engine.coordinates import base_name
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import EFFECT_NATS
-from avtorch.gap.result.budget import Axis, Location
-from avtorch.gap.result.free_runs import CountedRows
+from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
 _MOST = 0.95  # share of the cause's effect that a part holds
@@ -34,6 +34,41 @@ PLAINLY = 0.6
 """Largest share of the rows since the onset that a part may cover."""
 RATE = 0.05
 """False-discovery rate."""
+
+
+Axis = Literal["time", "speed", "command", "frequency", "signal"]
+UNITS: dict[Axis, str] = {"time": "s", "speed": "m/s", "command": "m/s²", "frequency": "Hz", "signal": ""}
+
+
+@dataclass(frozen=True)
+class Location:
+    """A part of the gap: `begin` to `end` on an `axis`, with its `share` of the cause's contribution.
+
+    Times are on the log's own clock [s], the others [m/s, m/s², Hz]; on the axis `signal` both are `"actuation"` (the
+    car's motion differs) or `"sensing"` (the accelerometer's reading differs). `q_value`: the false-discovery rate at
+    which all parts with a q-value as small are named.
+    """
+
+    axis: Axis
+    begin: float | str
+    end: float | str
+    share: float
+    q_value: float
+
+    def words(self, epoch_s: float = 0.0) -> str:
+        """The part as a phrase; times count from `epoch_s`, the log's start on its own clock."""
+        if isinstance(self.begin, str) or isinstance(self.end, str):
+            return "in the car's motion" if self.begin == "actuation" else "in the accelerometer's reading"
+        if self.axis == "time":
+            return f"from {self.begin - epoch_s:.1f} to {self.end - epoch_s:.1f} s after the log's start"
+        at, unit = "frequencies" if self.axis == "frequency" else f"{self.axis}s", UNITS[self.axis]
+        ends = f"from {self.begin:.2g} to {self.end:.2g}" if self.begin else f"below {self.end:.2g}"
+        return f"at {at} {ends} {unit}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `where` in `diagnosis.json`."""
+        part = {"axis": self.axis, "from": self.begin, "to": self.end}
+        return part | {"share": self.share, "q_value": self.q_value}
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +105,7 @@ def row_attribution(rows: CountedRows, h: Hypothesis, base: Hypothesis) -> RowAt
     does = rows.of_rows(_squares(h, h.predicted - base.predicted)).sum(1)
     sensed = _without_sensor(h)
     felt = np.zeros_like(does) if sensed is None else rows.of_rows(_squares(h, h.predicted - sensed)).sum(1)
-    moved = (rows.simulated(h) - rows.simulated(base)).mean(-1)
+    moved = (rows.errors(base) - rows.errors(h)).mean(-1)
     return RowAttribution(record=rows, gained=gained, paid=float(cost), does=does, felt=felt, moved=moved)
 
 
@@ -179,8 +214,8 @@ def _band(attribution: RowAttribution) -> Iterator[Part]:
     record = attribution.record
     accel = attribution.moved[0] if "accel" in record.channels else np.gradient(attribution.moved[-1]) / record.dt
     power, f = np.zeros(0), np.zeros(0)
-    for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
-        x = accel[first:last]
+    for part in record.stretches:
+        x = accel[part]
         power = np.concatenate([power, np.abs(np.fft.rfft(x * np.hanning(len(x))))[1:] ** 2])
         f = np.concatenate([f, np.fft.rfftfreq(len(x), record.dt)[1:]])
     if not power.sum() > 0:

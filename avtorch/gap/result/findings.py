@@ -9,10 +9,10 @@ from typing import Any
 from numpy.typing import NDArray
 
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.budget import Budget, Location
+from avtorch.gap.result.attribution import Location
+from avtorch.gap.result.budget import Budget
 from avtorch.gap.result.free_form import FreeForm
-from avtorch.gap.result.gap_budget import Shrinkage
-from avtorch.gap.result.gap_size import GapSize
+from avtorch.gap.result.gap_size import GapSize, Shrinkage
 from avtorch.gap.result.hypotheses import AnswerPart, Candidate, Scope, Verdict, candidate_name, listed_candidates
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.predictive_model import PredictiveModel

@@ -19,8 +19,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import NamedTuple, Self
+from functools import cache, cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -34,7 +34,7 @@ from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.hypothesis import Hypothesis, plant_of
 from avtorch.gap.engine.priors import MAP_SIZE
 from avtorch.gap.engine.sample import sample
-from avtorch.gap.result.budget import HORIZON_S
+from avtorch.gap.result.counted_rows import HORIZON_S
 from avtorch.gap.result.output_error import SETTLED_S, STEP_S, Coefficients, Rows, Runs
 from avtorch.gap.simulator.chain import at_place
 from avtorch.gap.simulator.effect import EffectContext
@@ -127,29 +127,32 @@ class FreeForm:
 
 
 # the car's runs -------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
 class Car:
     """What a car without a free form does along `rows`: at ln T_L, `named` gives the mean acceleration over each step
     (row,) [m/s²]. `lag`: mean and standard deviation of ln T_L. Of gains that the table has at any size, standard
-    deviations: `steep` [-], and `slope` [-], of their change over a standard deviation of the speed.
+    deviations: `steep` [-], and `slope` [-], of their change over a standard deviation of the speed. `longest_s`,
+    `settled_s`: see `Runs.of`.
 
     Of a closed loop the runs go over whole blocks, begun `before_s` [s] earlier, and errors are whitened: of each, the
     share `kept` [-] is left in the next. A resistance's line is then no vaguer than its bends: its slope is a feedback
     of the speed, which the loop has already."""
 
-    steep = 0.0
-    slope = 0.0
-    longest_s = HORIZON_S
-    settled_s = SETTLED_S
+    rows: Rows
+    named: Callable[[float], FloatArray] = field(repr=False)
+    lag: tuple[float, float]
+    steep: float = 0.0
+    slope: float = 0.0
+    longest_s: float = HORIZON_S
+    settled_s: float = SETTLED_S
     before_s: float | None = None
-    kept = 0.0
+    kept: float = 0.0
 
-    def __init__(self, rows: Rows, named: Callable[[float], FloatArray], lag: tuple[float, float]) -> None:
-        self.rows, self.named, self.lag = rows, named, lag
-        self.zero = np.append(np.zeros(rows.shape[0] * rows.shape[1] + rows.shape[1] + 1), lag[0])
-        self._known: dict[tuple[float, bool], Runs] = {}
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "named", cache(self.named))
 
     @classmethod
-    def of(cls, h: Hypothesis, baseline: GapPlant | None, lag: tuple[float, float]) -> Self:
+    def of(cls, h: Hypothesis, baseline: GapPlant | None, lag: tuple[float, float]) -> Car:
         """A hypothesis without a force map."""
         data = h.data
         assert data.speed is not None
@@ -172,24 +175,26 @@ class Car:
 
         return cls(rows, named, lag)
 
-    def runs(self, log_lag: float, *, cut: bool = False) -> Runs:
-        """The free runs of the car with that ln T_L; `cut`: none goes beyond its block."""
-        if (log_lag, cut) not in self._known:
-            rows, named, settled_s = self.rows, self.named(log_lag), self.settled_s
-            if self.before_s is None:
-                edges = self.edges if cut else None
-                runs = Runs.of(rows, named, edges, longest_s=self.longest_s, settled_s=settled_s)
-            else:
-                runs = Runs.over_blocks(rows, named, self.edges, before_s=self.before_s, settled_s=settled_s)
-            self._known[log_lag, cut] = runs
-        return self._known[log_lag, cut]
+    @property
+    def zero(self) -> FloatArray:
+        """The coefficients (table, curve, gain, ln T_L) without a free form."""
+        u, v = self.rows.shape
+        return np.append(np.zeros(u * v + v + 1), self.lag[0])
 
-    def with_runs(self, longest_s: float, settled_s: float | None = None) -> Car:
-        """The same car with runs up to `longest_s` [s], the first one `settled_s` [s] after a stretch begins."""
-        out = Car(self.rows, self.named, self.lag)
-        out.steep, out.slope, out.longest_s = self.steep, self.slope, longest_s
-        out.settled_s = self.settled_s if settled_s is None else settled_s
-        return out
+    @cached_property
+    def runs(self) -> Runs:
+        """The free runs."""
+        return self._runs(None)
+
+    @cached_property
+    def runs_in_blocks(self) -> Runs:
+        """The free runs of which none goes beyond its block."""
+        return self._runs(self.edges)
+
+    def _runs(self, edges: IntArray | None) -> Runs:
+        if self.before_s is None:
+            return Runs.of(self.rows, edges, self.longest_s, self.settled_s)
+        return Runs.over_blocks(self.rows, self.edges, self.before_s, self.settled_s)
 
     @cached_property
     def edges(self) -> IntArray:
@@ -301,7 +306,7 @@ class Fit:
 
     def __init__(self, car: Car, x: FloatArray, *, cut: bool = False) -> None:
         self.car, self.x = car, x
-        self.runs = car.runs(float(x[-1]), cut=cut)
+        self.runs = car.runs_in_blocks if cut else car.runs
         self.errors, slopes = drive(car, x, slopes=True, cut=cut)
         aside = x.copy()
         aside[-1] += _LAG_STEP
@@ -311,8 +316,9 @@ class Fit:
 
 def drive(car: Car, x: FloatArray, *, slopes: bool = False, cut: bool = False) -> tuple[FloatArray, FloatArray]:
     """Errors (error,) of the runs at coefficients, and their slopes but for ln T_L."""
-    runs = car.runs(float(x[-1]), cut=cut)
-    errors, by = runs.drive(float(np.exp(x[-1])), Coefficients.of(x[:-1], car.rows.shape), slopes=slopes)
+    runs, log_lag = car.runs_in_blocks if cut else car.runs, float(x[-1])
+    at = Coefficients.of(x[:-1], car.rows.shape)
+    errors, by = runs.drive(car.named(log_lag), float(np.exp(log_lag)), at, slopes=slopes)
     if car.kept:
         errors = _whitened(errors, runs.of_run, car.kept)
         by = _whitened(by, runs.of_run, car.kept) if slopes else by
@@ -469,7 +475,7 @@ class FittedForm:
 
     def without(self, without: Sequence[slice]) -> FloatArray:
         """Acceleration [m/s²] on the grid that it adds to the hypothesis at `lagged`, taught by the other rows."""
-        car, rows, runs = self.car, self.car.rows, self.car.runs(float(self.x[-1]), cut=True)
+        car, rows, runs = self.car, self.car.rows, self.car.runs_in_blocks
         first, last = rows.source[runs.counts], rows.source[runs.end - 1]
         held = np.any([(last >= r.start) & (first < r.stop) for r in without], axis=0)
         x = self.x
@@ -507,7 +513,7 @@ def fitted_form(h: Hypothesis, baseline: GapPlant | None, bare: Hypothesis) -> F
     h, bare = _as_a_plant(h), _as_a_plant(bare)
     lags = np.log(sample(h, chains=1, draws=_DRAWS, seed=0, method="laplace")["T_L"].reshape(-1))
     car = Car.of(h, baseline, (float(np.log(h["T_L"])), max(float(lags.std()), _LEAST_LAG_SD)))
-    runs = car.runs(car.lag[0], cut=True)
+    runs = car.runs_in_blocks
     left = LeftOut.of(runs, car.edges) if len(runs.of_run) else None
     if left is None:
         return None

@@ -19,20 +19,22 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.average import ModelAverage, Weight, free_form_response
-from avtorch.gap.engine.coordinates import EFFECTS, base_name
+from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name
 from avtorch.gap.engine.family import FORMS, family_of
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.outliers import rate_onset
 from avtorch.gap.engine.priors import TEMPER
 from avtorch.gap.engine.search import Search
 from avtorch.gap.quantity import Quantity, of_fields, unit_of
-from avtorch.gap.result.budget import LIKELY, Location
+from avtorch.gap.result.attribution import Location
 from avtorch.gap.result.parameters import OwnRandom, ParameterPosterior
 from avtorch.gap.simulator.effect import Effect, candidate_name, delay_effect
 from avtorch.gap.simulator.plant import BASELINE, GapPlant
 from avtorch.io.units import GRAVITY
 
 ALWAYS = ("none", "unknown")
+LIKELY = 0.5
+"""Probability from which a part is named."""
 LEAST_LISTED = 1e-4
 """Hypotheses less probable than this are left out of an answer; `none` and `unknown` never are."""
 ALIAS_RATIO = 0.03
@@ -465,15 +467,10 @@ def _size(posterior: ParameterPosterior, name: str) -> Quantity | None:
         return None
     does = [a - b for a, b in zip(h.rows(), h.without(effect).rows(), strict=True)]
     size = max(float(np.sqrt((x**2).mean())) for x in does)
-    return Quantity.of_draws(size * _relative(posterior, effect))
-
-
-def _relative(posterior: ParameterPosterior, effect: str) -> FloatArray:
-    """Draws (draw,) of the size of an effect's first coordinate over that of the fit."""
-    h, coordinates = posterior.hypothesis, EFFECTS[effect].coordinates
+    coordinates = EFFECTS[effect].coordinates
     if not coordinates:
-        return np.ones(1)
-    first = coordinates[0]
-    neutral = h.without(effect)[first.name]
-    at = h[first.name] - neutral
-    return np.abs(posterior.draws[first.name].reshape(-1) - neutral) / max(abs(at), 1e-12)
+        return Quantity.of_draws(size)
+    name = coordinates[0].name  # relative to whose value at the fit draws are
+    neutral = float(h.neutral[INDEX[name]])
+    away = np.abs(posterior.draws[name].reshape(-1) - neutral)
+    return Quantity.of_draws(size * away / max(abs(h[name] - neutral), 1e-12))

@@ -78,7 +78,10 @@ def manoeuvres(traces: Traces, *, most: int = 6, named: bool = True) -> tuple[Ma
     step = traces.step
     low, high = np.quantile(traces.command, (0.05, 0.95))
     least = max(_LEAST, _SHARE * float(high - low))
-    lines = _accelerations(traces, step, named=named)
+    names = ("measured", "baseline simulator", "with what was named")
+    lines = {"command": traces.command} | dict(zip(names, traces.accelerations(_SLOPE_S), strict=True))
+    if not named:
+        del lines["with what was named"]
     before = lines["measured"] - lines["baseline simulator"]
     energy = np.concatenate([[0.0], np.cumsum(before**2)])
     whole = float(energy[-1]) or 1.0
@@ -113,28 +116,6 @@ def _chosen(ranked: Sequence[_Change], most: int) -> list[_Change]:
             if apart and len(taken) < most and sum(other[1] == each[1] for other in taken) < limit:
                 taken.append(each)
     return sorted(taken, reverse=True, key=lambda change: change[0])
-
-
-def _accelerations(traces: Traces, step: float, *, named: bool) -> dict[str, FloatArray]:
-    sources = {"measured": traces.measured, "baseline simulator": traces.before}
-    sources |= {"with what was named": traces.after} if named else {}
-    measured, half = "accel" in traces.channels, max(1, round(_SLOPE_S / step / 2))
-    return {"command": traces.command} | {
-        name: values[traces.channels.index("accel")] if measured else _slope(values[0], traces, half, step)
-        for name, values in sources.items()
-    }
-
-
-def _slope(speed: FloatArray, traces: Traces, half: int, step: float) -> FloatArray:
-    """Of a speed, about each row; at the ends of a stretch that of the nearest row that has one."""
-    slope = np.empty_like(speed)
-    for rows in traces.stretches:
-        if len(rows) <= 2 * half:
-            slope[rows] = 0.0 if len(rows) < 2 else (speed[rows[-1]] - speed[rows[0]]) / (step * (len(rows) - 1))
-            continue
-        middle = (speed[rows[2 * half :]] - speed[rows[: -2 * half]]) / (2 * half * step)
-        slope[rows] = np.concatenate([np.full(half, middle[0]), middle, np.full(half, middle[-1])])
-    return slope
 
 
 def _changes(command: FloatArray, stretch: IntArray, step: float, least: float) -> list[tuple[int, int]]:

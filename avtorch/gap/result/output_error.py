@@ -18,7 +18,6 @@ import numpy as np
 from numba import njit
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
-from avtorch.gap.result.budget import HORIZON_S
 
 STEP_S = 0.1
 """Step of the runs [s]: a command is averaged over it, and lags are exact."""
@@ -75,27 +74,15 @@ class Rows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Free runs over `rows` from row `first` (run,) to before row `end` (run,), errors counting from row `counts` on.
-
-    `named` (row,) [m/s²]: what the car does without free forms, mean over the step.
-    """
+    """Free runs over `rows` from row `first` (run,) to before row `end` (run,); errors count from row `counts` on."""
 
     rows: Rows
-    named: FloatArray = field(repr=False)
     first: IntArray = field(repr=False)
     end: IntArray = field(repr=False)
     counts: IntArray = field(repr=False)
 
     @classmethod
-    def of(
-        cls,
-        rows: Rows,
-        named: FloatArray,
-        edges: IntArray | None = None,
-        *,
-        longest_s: float = HORIZON_S,
-        settled_s: float = SETTLED_S,
-    ) -> Runs:
+    def of(cls, rows: Rows, edges: IntArray | None, longest_s: float, settled_s: float) -> Runs:
         """Begun every second of each stretch, or more rarely in long drives; none goes beyond one of `edges` (edge,),
         rows that are the stretches' own starts and may be more. `longest_s`, `settled_s`: of a run, and of a stretch
         before the first one [s]."""
@@ -109,12 +96,10 @@ class Runs:
             first.append(own)
             end.append(np.minimum(own + round(longest_s / dt), j))
         a = np.concatenate(first)
-        return cls(rows, named, a, np.concatenate(end), a)
+        return cls(rows, a, np.concatenate(end), a)
 
     @classmethod
-    def over_blocks(
-        cls, rows: Rows, named: FloatArray, edges: IntArray, *, before_s: float, settled_s: float = SETTLED_S
-    ) -> Runs:
+    def over_blocks(cls, rows: Rows, edges: IntArray, before_s: float, settled_s: float) -> Runs:
         """One for each block between `edges` (edge,), begun `before_s` [s] earlier where its stretch allows: how it
         began has faded when it counts."""
         i, j = edges[:-1], edges[1:]
@@ -123,19 +108,22 @@ class Runs:
         first = np.maximum(i - round(before_s / rows.dt), stretch)
         counts = np.maximum(i, first)
         kept = j - counts > max(2, round(_SHORTEST_S / rows.dt))
-        return cls(rows, named, first[kept], j[kept], counts[kept])
+        return cls(rows, first[kept], j[kept], counts[kept])
 
     @cached_property
     def of_run(self) -> IntArray:
         """The run of each error (error,)."""
         return np.repeat(np.arange(len(self.first)), (self.end - self.counts - 1) // self.rows.between)
 
-    def drive(self, lag: float, at: Coefficients, *, slopes: bool = False) -> tuple[FloatArray, FloatArray]:
-        """Errors (error,) [m/s] of all runs and, with `slopes`, their derivatives (error, coefficient)."""
+    def drive(
+        self, named: FloatArray, lag: float, at: Coefficients, *, slopes: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
+        """Errors (error,) [m/s] of all runs and, with `slopes`, their derivatives (error, coefficient). `named` (row,)
+        [m/s²]: what the car does without free forms, mean over the step."""
         rows = self.rows
         return _drive(
             *(self.first, self.end, self.counts, rows.between, rows.dt, lag),
-            *(self.named, rows.command, rows.speed, rows.starts),
+            *(named, rows.command, rows.speed, rows.starts),
             *(rows.knots_u, rows.knots_v, np.ascontiguousarray(at.table), at.curve, at.gain),
             rows.command if rows.feed is None else rows.feed,
             *(-1.0 if rows.loop_s is None else rows.loop_s / rows.dt, len(self.of_run), slopes),

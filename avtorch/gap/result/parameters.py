@@ -15,7 +15,9 @@ import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.gap.effects import Gust, Outliers, RoadGrade
+from avtorch.gap.effects.gust import Gust
+from avtorch.gap.effects.outliers import Outliers
+from avtorch.gap.effects.road_grade import RoadGrade
 from avtorch.gap.engine.average import ModelAverage, Weight
 from avtorch.gap.engine.coordinates import EFFECTS, Coordinate, base_name
 from avtorch.gap.engine.hypothesis import Hypothesis, effect_values, plant_of
@@ -167,7 +169,7 @@ class ParameterPosterior:
         out = {name: self._column(name)[::every][:count] for name in ("T_L", "K_L")}
         for e in self.effects:
             effect = self._drawn(e)
-            for p in effect.coordinates():
+            for p in effect.parameters:
                 value = getattr(effect, p.name, None)
                 if isinstance(value, torch.Tensor) and value.dim() == 1:
                     out[f"{effect.name}.{p.name}"] = value.numpy()[::every][:count]

@@ -50,19 +50,11 @@ class Residuals:
     @classmethod
     def of(cls, traces: Traces) -> Residuals:
         """The residuals of a diagnosis' traces."""
-        step = traces.step
-        k = traces.channels.index("accel") if "accel" in traces.channels else 0
-        channel = traces.channels[k]
-        errors = [traces.measured[k] - x[k] for x in (traces.before, traces.after)]
-        rows = np.arange(len(traces.time))
-        if channel == "speed":
-            width = max(1, round(_SLOPE_S / step))
-            begin = np.arange(len(rows) - width)
-            begin = begin[traces.stretch[begin] == traces.stretch[begin + width]]
-            errors = [(e[begin + width] - e[begin]) / (width * step) for e in errors]
-            rows = begin + width // 2
-        speed = None if traces.speed is None else traces.speed[rows]
-        return cls(channel, step, traces.time[rows], traces.stretch[rows], traces.command[rows], speed, *errors)
+        measured, *simulated = traces.accelerations(_SLOPE_S)
+        both = (measured - x for x in simulated)
+        rows = (traces.time, traces.stretch, traces.command, traces.speed)
+        channel = "accel" if "accel" in traces.channels else "speed"
+        return cls(channel, traces.step, *rows, *both)
 
     def against(self, axis: FloatArray, residual: FloatArray, *, bins: int = 9) -> BinnedMeans:
         """Means of `residual` (row,) in bins of `axis` (row,) that hold as many rows each."""

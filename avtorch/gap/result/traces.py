@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from itertools import pairwise
 from typing import Literal, Self
 
 import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
-from avtorch.gap.drive_record import MeasuredRows
-from avtorch.gap.result.budget import BEGIN_S, HORIZON_S
+from avtorch.gap.result.counted_rows import HORIZON_S, CountedRows, free_runs, runs_over
 from avtorch.io import Log
 
 Reason = Literal["driver", "standstill", "gap", "settling"]
@@ -64,7 +62,7 @@ class Traces:
 
     @classmethod
     def of(
-        cls, rows: MeasuredRows, before: FloatArray, after: FloatArray, does: FloatArray, logs: Sequence[Log] = ()
+        cls, rows: CountedRows, before: FloatArray, after: FloatArray, does: FloatArray, logs: Sequence[Log] = ()
     ) -> Self:
         """Of counted rows; `before`, `after` (channel, row, group): the simulator's. `logs`: for what did not count."""
         measured, before, after = (x.mean(-1) for x in (rows.measured, before, after))
@@ -87,26 +85,40 @@ class Traces:
         """Measured speed, (row,); None where it was not measured."""
         return self.measured[self.channels.index("speed")] if "speed" in self.channels else None
 
-    @cached_property
+    @property
+    def runs(self) -> list[slice]:
+        """Rows of free runs of at most `HORIZON_S`; each stretch begins one."""
+        parts = [slice(int(rows[0]), int(rows[-1]) + 1) for rows in self.stretches]
+        return runs_over(parts, round(HORIZON_S / self.step))
+
+    @property
     def piece(self) -> IntArray:
-        """Number (row,) of the rollout of at most `HORIZON_S` that a row belongs to; each stretch begins one."""
-        since = np.concatenate([self.time[rows] - self.time[rows[0]] for rows in self.stretches])
-        begins = (np.diff(self.stretch, prepend=-1) != 0) | (np.diff(since // HORIZON_S, prepend=-1.0) > 0)
-        return np.cumsum(begins) - 1
+        """Number (row,) of the run that a row belongs to."""
+        return np.repeat(np.arange(len(self.runs)), [run.stop - run.start for run in self.runs])
 
     def begun_anew(self, simulated: FloatArray) -> FloatArray:
-        """`simulated` (channel, row), with a speed that begins each `piece` at the measured one, as in the budget: over
-        a whole drive it would drift without end on a car that rolls to a stop where its simulator does not.
+        """`simulated` (channel, row), with a speed that begins each of the `runs` at the measured one: over a whole
+        drive it would drift without end on a car that rolls to a stop where its simulator does not.
         """
         if "speed" not in self.channels:
             return simulated
-        k = self.channels.index("speed")
-        off = self.measured[k] - simulated[k]
-        firsts = np.flatnonzero(np.diff(self.piece, prepend=-1))
-        starts = self.time - self.time[firsts][self.piece] <= BEGIN_S
-        level = np.bincount(self.piece[starts], off[starts]) / np.bincount(self.piece[starts])
-        out = simulated.copy()
-        out[k] += level[self.piece]
+        k, out = self.channels.index("speed"), simulated.copy()
+        out[k] = self.measured[k] - free_runs(self.measured[k] - simulated[k], self.runs, self.step)
+        return out
+
+    def accelerations(self, over_s: float) -> tuple[FloatArray, ...]:
+        """Measured and simulated, `before` and `after`: (row,) [m/s²] each. Where none was measured, slopes of the
+        speeds about each row over `over_s` [s]; at the ends of a stretch those of the nearest row that has one."""
+        k = self.channels.index("accel") if "accel" in self.channels else None
+        each = (x[k or 0] for x in (self.measured, self.before, self.after))
+        return tuple(self._slope(x, over_s) if k is None else x for x in each)
+
+    def _slope(self, speed: FloatArray, over_s: float) -> FloatArray:
+        out, step = np.empty_like(speed), self.step
+        for rows in self.stretches:
+            width = min(max(2, 2 * round(over_s / step / 2)), len(rows) - 1)
+            slope = (speed[rows[width:]] - speed[rows[: len(rows) - width]]) / (max(width, 1) * step)
+            out[rows] = slope[np.clip(np.arange(len(rows)) - width // 2, 0, len(slope) - 1)]
         return out
 
     def fit(self, simulated: FloatArray) -> FloatArray:
@@ -122,7 +134,7 @@ class Traces:
         return 100 * (1 - np.divide(error, spread, out=np.full_like(error, np.nan), where=spread > 0))
 
 
-def uncounted(logs: Sequence[Log], record: MeasuredRows) -> tuple[Uncounted, ...]:
+def uncounted(logs: Sequence[Log], record: CountedRows) -> tuple[Uncounted, ...]:
     """What `record`, made of these `logs`, does not count, in order of time."""
     found: list[Uncounted] = []
     for number, counted in enumerate(np.unique(record.log).tolist()):

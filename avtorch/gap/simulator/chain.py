@@ -93,8 +93,7 @@ def rollout(
         if e.memory and type(e).over is Effect.over:  # looped over rows: its values stay (...)
             whole.append(e)
             continue
-        long = {p.name for p in e.coordinates() if p.size > 1}
-        whole.append(replace(e, **{k: v if k in long else v[..., None] for k, v in e.values().items()}))
+        whole.append(replace(e, **{k: v[..., None] for k, v in e.values().items()}))
 
     parts = substeps(whole, drive.command, row, lambda e, u: e.over(u, rows[e.name]))
     accel0 = parts[0].target[..., 0]
@@ -139,8 +138,7 @@ def _shape(effects: list[Effect], row: EffectContext, drive: SimulatorInput) -> 
     shapes += [x.shape for x in (drive.speed,) if x is not None]
     shapes += [(*x.shape, 1) for x in (drive.accel0,) if isinstance(x, Tensor)]
     for e in effects:
-        long = {p.name for p in e.coordinates() if p.size > 1}
-        shapes += [(*(v.shape[:-1] if k in long else v.shape), 1) for k, v in e.values().items()]
+        shapes += [(*v.shape, 1) for v in e.values().values()]
     return torch.Size(np.broadcast_shapes(*shapes))
 
 
@@ -272,7 +270,7 @@ def _end_context(past: SimulationState, v: Tensor, speed: Tensor, position: Tens
 
 def context_of(past: SimulationState, v: Tensor, x: Tensor, dt: float) -> EffectContext:
     now, step = torch.tensor(past.time, dtype=torch.float64), torch.tensor(dt, dtype=torch.float64)
-    return EffectContext(now, step, v, x, past.T_L, past.K_L, whole=False)
+    return EffectContext(now, step, v, x, past.T_L, past.K_L)
 
 
 def drawn_for(past: SimulationState, effect: Effect, row: EffectContext) -> EffectContext:

@@ -72,7 +72,6 @@ class EffectContext:
     T_L: Tensor
     K_L: Tensor
     normal: Tensor | None = None
-    whole: bool = True
 
     @property
     def speed(self) -> Tensor:
@@ -96,7 +95,7 @@ def context_at(row: EffectContext, k: int) -> EffectContext:
         return None if x is None else x if x.dim() == 0 else x[..., 0 if x.shape[-1] == 1 else k]
 
     parts = (row.time, row.dt, row.measured_speed, row.travelled, row.T_L, row.K_L, row.normal)
-    return EffectContext(*(pick(x) for x in parts), whole=False)
+    return EffectContext(*(pick(x) for x in parts))
 
 
 @dataclass(frozen=True)
@@ -129,9 +128,9 @@ class Effect:
 
     `reading`: what a sensor's effect acts on. `gravity`: a body force that an accelerometer does not measure (see
     `SimulatorInput.specific_force`). `derived`: what `report` names in place of coordinates that are not reported,
-    with typical and possible ranges. `shift`: the parameter [s], if there is one, by which it delays commands and does
-    nothing else. `settings`: valid values in a text for fields that are not parameters; a field without a domain takes
-    any single finite number.
+    with typical and possible ranges. `words`: what it does to the car, as a clause with its parameters in braces.
+    `shift`: the parameter [s], if there is one, by which it delays commands and does nothing else. `settings`: valid
+    values in a text for fields that are not parameters; a field without a domain takes any single finite number.
 
     `own_onset`: the parameter [s] that is its onset; no other onset is tried. `of_the_drive`: its parameters belong to
     a drive and not to the car. `memory`, `random`: whether it has `advance` and `noise`, which need not be said.
@@ -154,6 +153,7 @@ class Effect:
     place: ClassVar[Place]
     meaning: ClassVar[str]
     equation: ClassVar[str]
+    words: ClassVar[str] = ""
     parameters: ClassVar[tuple[Parameter, ...]]
     settings: ClassVar[tuple[Domain, ...]] = ()
     order: ClassVar[int] = 0
@@ -221,15 +221,11 @@ class Effect:
 
     @classmethod
     def in_words(cls, values: Mapping[str, float]) -> str:
-        """What it does to the car, as a clause, at `values` of its parameters under the answer's names.
+        """What it does to the car, as a clause, at `values` of its parameters under the answer's names: its `words`.
 
         Empty for an effect that is called by its name.
         """
-        return ""
-
-    def coordinates(self) -> tuple[Parameter, ...]:
-        """The parameters of a fit: `parameters`, unless settings of this instance affect them."""
-        return self.parameters
+        return cls.words.format_map(values)
 
     def prepared(self, time: Tensor, speed: Tensor | None, position: Tensor | None) -> Self:
         """This effect with the settings taken from a drive (mean speed, span), each (time,)."""
@@ -245,11 +241,11 @@ class Effect:
 
     def report(self, T_L: Tensor) -> dict[str, Tensor]:
         """The parameters under the answer's names, given the plant's lag."""
-        return {p.name: tensor(getattr(self, p.name)) for p in self.coordinates() if p.reported}
+        return {p.name: tensor(getattr(self, p.name)) for p in self.parameters if p.reported}
 
     def values(self) -> dict[str, Tensor]:
         """The fit's coordinates by name, without those that are None."""
-        named = {p.name: getattr(self, p.name) for p in self.coordinates()}
+        named = {p.name: getattr(self, p.name) for p in self.parameters}
         return {name: tensor(value) for name, value in named.items() if value is not None}
 
     def replaced(self, values: Mapping[str, Any]) -> Self:
@@ -381,7 +377,7 @@ def cause_words(name: str, values: Mapping[str, float]) -> str:
         ('the command acts after a delay', '')
     """
     kind = EFFECTS.get(name)
-    if kind is None or kind.in_words.__func__ is Effect.in_words.__func__:
+    if kind is None or (not kind.words and kind.in_words.__func__ is Effect.in_words.__func__):
         return ""
     needed = [p.name for p in (kind.derived or kind.parameters) if p.reported]
     if any(math.isnan(values.get(key, math.nan)) for key in needed):

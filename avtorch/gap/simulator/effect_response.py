@@ -51,7 +51,7 @@ def shown_at(effect: Effect) -> float:
 
 
 def _typical(kind: type[Effect]) -> Effect:
-    return kind(**{p.name: float(p.typical()) for p in kind.parameters if p.size == 1})
+    return kind(**{p.name: float(p.typical()) for p in kind.parameters})
 
 
 @lru_cache(maxsize=256)

@@ -8,7 +8,6 @@ needs no Jacobian and every coordinate of a fit has scale one. The typical range
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from avtorch.errors import InputError, printable
 
-Constraint = Literal["real", "positive", "negative", "unit", "interval"]
+Constraint = Literal["real", "positive", "negative", "unit"]
 
 _CENTRAL_80 = 1.2815515655446004  # normal quantile of 0.9
 _AS_FAR = 3.0  # multiple of the typical range, where an effect does not state what is possible
@@ -27,21 +26,15 @@ _AS_FAR = 3.0  # multiple of the typical range, where an effect does not state w
 # typical ranges come from experience: no car exceeds them a thousandfold, nor does a fit fall a million times below
 _FAR, _NEAR = 1e3, 1e6
 
-# torch.special has no types
-_normal_distribution = cast(Callable[[Tensor], Tensor], torch.special.ndtr)  # pyright: ignore[reportUnknownMemberType]
-_normal_quantile = cast(Callable[[Tensor], Tensor], torch.special.ndtri)  # pyright: ignore[reportUnknownMemberType]
-
 
 @dataclass(frozen=True)
 class Parameter:
     """`name` (the key in an answer), `unit`, `neutral` value (None: any, once the others are neutral), typical range.
 
     `constraint` is the link: `"real"` the value itself, `"positive"` its log, `"negative"` the log of its opposite,
-    `"unit"` (0 to 1) its logit, `"interval"` uniform from `low` to `high`, by the normal distribution function.
-    `reported` False: a coordinate that is fitted but not part of the answer. `size`: 1, or the length of a
-    vector-valued coordinate, then on its last dimension. `of_onset`: identifiable only where an effect has an onset
-    during a drive, and held at its prior's centre elsewhere. `possible`: the physically possible range; an answer
-    entirely outside it is reported as implausible. Default: three times the typical range, on the link's scale.
+    `"unit"` (0 to 1) its logit. `reported` False: a coordinate that is fitted but not part of the answer. `possible`:
+    the physically possible range; an answer entirely outside it is reported as implausible. Default: three times the
+    typical range, on the link's scale.
 
     Raises `InputError` for a range that is empty or outside the constraint.
 
@@ -62,14 +55,12 @@ class Parameter:
     high: float
     constraint: Constraint = "positive"
     reported: bool = True
-    size: int = 1
-    of_onset: bool = False
     possible: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not self.low < self.high:
             raise InputError(f"{self.name}: found the range {self.low:g} to {self.high:g}, needs low < high")
-        if self.constraint != "interval" and not all(math.isfinite(x) for x in self._ends):
+        if not all(math.isfinite(x) for x in self._ends):
             raise InputError(f"{self.name}: {self.low:g} to {self.high:g} is not within {self.constraint!r}")
         if self.possible is not None and not self.possible[0] < self.possible[1]:
             raise InputError(f"{self.name}: found possible={self.possible!r}, needs low < high")
@@ -77,13 +68,11 @@ class Parameter:
     @property
     def location(self) -> float:
         """Centre of the prior on the link's scale."""
-        return 0.0 if self.constraint == "interval" else 0.5 * sum(self._ends)
+        return 0.5 * sum(self._ends)
 
     @property
     def spread(self) -> float:
         """Standard deviation of the prior on the link's scale."""
-        if self.constraint == "interval":
-            return 1.0
         low, high = self._ends
         return abs(high - low) / (2 * _CENTRAL_80)
 
@@ -92,8 +81,6 @@ class Parameter:
         """The physically possible least and greatest value: `possible`, or its default."""
         if self.possible is not None:
             return self.possible
-        if self.constraint == "interval":
-            return self.low, self.high
         z = _AS_FAR * _CENTRAL_80 * torch.tensor([-1.0, 1.0], dtype=torch.float64)
         low, high = sorted(float(x) for x in self.constrain(z))
         return low, high
@@ -111,8 +98,6 @@ class Parameter:
             return (-value).log()
         if self.constraint == "unit":
             return torch.logit(value)
-        if self.constraint == "interval":
-            return _normal_quantile((value - self.low) / (self.high - self.low))
         return value
 
     def constrain(self, z: Tensor) -> Tensor:
@@ -124,8 +109,6 @@ class Parameter:
             return -x.exp()
         if self.constraint == "unit":
             return torch.sigmoid(x)
-        if self.constraint == "interval":
-            return self.low + (self.high - self.low) * _normal_distribution(x)
         return x
 
     def unconstrain(self, value: Tensor) -> Tensor:
@@ -134,13 +117,11 @@ class Parameter:
 
     def typical(self) -> Tensor:
         """The prior's median."""
-        shape = () if self.size == 1 else (self.size,)
-        return self.constrain(torch.zeros(shape, dtype=torch.float64))
+        return self.constrain(torch.zeros((), dtype=torch.float64))
 
     def sample(self, *shape: int, generator: torch.Generator | None = None) -> Tensor:
-        """Draws from the prior, of the given shape (and the parameter's size last, where it has one)."""
-        full = shape if self.size == 1 else (*shape, self.size)
-        return self.constrain(torch.randn(full, generator=generator, dtype=torch.float64))
+        """Draws from the prior, of the given shape."""
+        return self.constrain(torch.randn(shape, generator=generator, dtype=torch.float64))
 
 
 @dataclass(frozen=True)
@@ -172,8 +153,6 @@ class Domain:
         """The domain from a millionth of the typical range of `parameter` to a thousand times that range."""
         low, high, kind = parameter.low, parameter.high, parameter.constraint
         unit = "" if parameter.unit == "-" else parameter.unit
-        if kind == "interval":  # its ends depend on a drive, which is not known yet
-            return cls(parameter.name, -1e12, 1e12, unit)
         ends = {
             "positive": (low / _NEAR, high * _FAR),
             "negative": (low * _FAR, high / _NEAR),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import math
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from os import PathLike
 from pathlib import Path
@@ -25,7 +25,6 @@ from avtorch.gap.simulator.force_table import FREE_FORMS
 from avtorch.gap.simulator.parameter import Domain, Parameter
 from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
 from avtorch.io.opening import parse_toml, place, read_toml
-from avtorch.numeral import numeral
 from avtorch.vehicle.arguments import Number, checked, tensor
 from avtorch.vehicle.plant import Motion
 
@@ -47,8 +46,6 @@ _DOMAINS = {
     "sigma": Domain("sigma", 0.0, 1e3, "m/s³"),
 }
 """Valid values of the baseline's parameters in a text."""
-
-_LONGEST = 10_000  # most characters of a plant as a short string
 
 
 class GapPlant:
@@ -89,7 +86,7 @@ class GapPlant:
     def parameters(self) -> dict[str, Parameter]:
         """The coordinates of a fit: `T_L`, `K_L`, and `effect.parameter` of each effect."""
         own = {p.name: p for p in BASELINE}
-        return own | {f"{e.name}.{p.name}": p for e in self.effects for p in e.coordinates()}
+        return own | {f"{e.name}.{p.name}": p for e in self.effects for p in e.parameters}
 
     def values(self) -> dict[str, Tensor]:
         """Their current values; those that are not set (a grade's profile) are left out."""
@@ -111,16 +108,12 @@ class GapPlant:
         effects = [e.replaced(own[e.name]) if own[e.name] else e for e in self.effects]
         return GapPlant(effects, **base, sigma=self.sigma, seed=self.seed)
 
-    def prepared(self, *drives: SimulatorInput, fitted: Collection[str] | None = None) -> GapPlant:
-        """The plant with the settings that effects take from a drive (mean speed, span, length of the road).
-
-        Several: parts of one drive, in order. `fitted`: names of the effects that take theirs from it; those of a given
-        simulator keep their own. Default: all.
-        """
+    def prepared(self, *drives: SimulatorInput) -> GapPlant:
+        """The plant with the settings that effects take from a drive (mean speed, length of the road), or from several
+        parts of one, in order."""
         flat = [_joined([getattr(d, name) for d in drives]) for name in ("speed", "position")]
         time = torch.cat([d.time for d in drives])
-        own = {e.name for e in self.effects} if fitted is None else set(fitted)
-        effects = [e.prepared(time, *flat) if e.name in own else e for e in self.effects]
+        effects = [e.prepared(time, *flat) for e in self.effects]
         return GapPlant(effects, T_L=self.T_L, K_L=self.K_L, sigma=self.sigma, seed=self.seed)
 
     def report(self) -> dict[str, dict[str, Tensor]]:
@@ -248,37 +241,24 @@ def _parsed(text: str, more: Iterable[type[Effect]] = ()) -> GapPlant:
     """A plant from TOML or a short string; `"glvd"` or nothing is bare GLVD. Raises `InputError` for errors in the
     text.
 
-    In a short string an effect's name sets its first parameter, `effect.parameter` any, and an effect without a value
-    has its typical ones.
+    A short string is a line of TOML for each of its commas. In it an effect's name sets its first parameter,
+    `effect.parameter` any, and an effect without a value has its typical ones.
     """
     if "\n" in text or "[" in text:
         return _of(parse_toml(text, "plant"), more)
-    if len(text) > _LONGEST:
-        raise InputError(f"plant: found {len(text):,} characters, needs {_LONGEST:,} at most, or a TOML file")
-    tables: dict[str, Any] = {}
-    for item in filter(None, (x.strip() for x in text.split(","))):
+    lines = []
+    for item in filter(None, map(str.strip, text.split(","))):
         key, equals, value = (x.strip() for x in item.partition("="))
-        if key.lower() == "glvd" and not equals:
-            continue
-        name, dot, parameter = key.partition(".")
-        if not equals:
-            known = effect_class(name, more).name if not dot else name
-            if known in tables or dot:
-                raise InputError(f"plant: found {quoted(item)}, needs an effect's name, once, or NAME=NUMBER")
-            tables[known] = {}
-            continue
-        try:
-            number = numeral(value)
-        except ValueError:
-            raise InputError(f"plant: found {quoted(item)}, needs a number after '='") from None
-        if key in _DOMAINS:
-            table, parameter = tables, key
-        else:
-            first = _first(effect_class(name, more))
-            table, parameter = tables.setdefault(name, {}), parameter if dot else first
-        if parameter in table:
-            raise InputError(f"plant: found {quoted(item)} besides another value, needs one")
-        table[parameter] = number
+        if equals and "." not in key and key not in _DOMAINS:
+            lines.append(f"{key}.{_first(effect_class(key, more))} = {value}")
+        elif equals or key.lower() != "glvd":
+            lines.append(item if equals else f"{item} = {{}}")
+    try:
+        tables = parse_toml("\n".join(lines), "plant")
+    except InputError:
+        raise InputError(
+            f"plant: found {quoted(text)}, needs effects, each once, with numbers, as dead_time=0.2"
+        ) from None
     return _of(tables, more)
 
 

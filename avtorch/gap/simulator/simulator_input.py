@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.vehicle.arguments import Number, checked
-
-if TYPE_CHECKING:
-    from avtorch.io import Log
 
 
 @dataclass(frozen=True)
@@ -76,26 +72,6 @@ class SimulatorInput:
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
-
-    @classmethod
-    def from_log(cls, log: Log, segment: int = 0) -> SimulatorInput:
-        """One segment of a log, with time from the log's start.
-
-        It starts from the measured acceleration, if there is one.
-
-        Rows with `engaged` 0 are included: their commands act in the response, although the car did not follow them.
-
-        Raises `InputError` for a missing segment or a log without `accel_cmd`.
-        """
-        if log.accel_cmd is None:
-            raise InputError("accel_cmd: not in the log, needed for the response of a plant")
-        rows = log.segment == segment
-        if rows.sum() < 2:
-            raise InputError(f"segment: found {segment}, needs a segment of the log with two rows or more")
-        speed = None if log.speed is None else torch.as_tensor(log.speed[rows])
-        accel0 = None if log.accel is None else float(log.accel[rows][0])
-        time, command = torch.as_tensor(log.elapsed[rows]), torch.as_tensor(log.accel_cmd[rows])
-        return cls(time, command, speed, accel0, log.accel_kind == "specific-force")
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ def test_an_effect_is_found_with_its_size(effect: Effect, key: str, rotating_see
 @pytest.mark.statistical
 def test_a_gain_that_fades_is_one_change_or_a_gain_that_wanders(rotating_seed: int) -> None:
     """A fade of half a minute is no step: in three drives of eight a course of the gain is likelier."""
-    fading = GainChange(gain_ratio=0.65, change_s=40.0, ramp_s=30.0, latest_s=120.0)
+    fading = GainChange(gain_ratio=0.65, change_s=40.0, ramp_s=30.0)
     found = found_in(recorded_log([fading], seconds=120.0, seed=rotating_seed), [*FEW, "gain_change"])
     if found.verdict.name == "unknown":
         likeliest = max(found.parts, key=lambda part: part.probability)

@@ -60,15 +60,15 @@ def test_slopes_of_free_runs_are_their_derivatives() -> None:
     starts[[0, 100]] = True
     command, speed = rng.normal(size=n), 10 + np.cumsum(rng.normal(size=n)) * 0.1
     knots = (np.array([-1.0, 0.0, 1.0]), np.array([8.0, 10.0, 12.0]))
-    runs = Runs.of(Rows(0.1, command, speed, np.arange(n), starts, *knots), 0.1 * command)
+    runs, named = Runs.of(Rows(0.1, command, speed, np.arange(n), starts, *knots), None, 10.0, 1.5), 0.1 * command
     x = 0.3 * rng.normal(size=13)
-    _, slopes = runs.drive(0.3, Coefficients.of(x, (3, 3)), slopes=True)
+    _, slopes = runs.drive(named, 0.3, Coefficients.of(x, (3, 3)), slopes=True)
     for k in range(len(x)):
         ends = []
         for sign in (-1, 1):
             moved = x.copy()
             moved[k] += sign * 1e-6
-            ends.append(runs.drive(0.3, Coefficients.of(moved, (3, 3)))[0])
+            ends.append(runs.drive(named, 0.3, Coefficients.of(moved, (3, 3)))[0])
         assert slopes[:, k] == pytest.approx((ends[1] - ends[0]) / 2e-6, abs=1e-4)
 
 
@@ -84,7 +84,7 @@ def test_a_free_form_that_loses_in_the_budgets_runs_is_not_handed_back(named: fl
     """Against names alone, and against the baseline; channels count alike, whatever their units."""
     scale = np.array([[4.0, 4.0], [0.01, 0.03]])  # (channel, block)
     steps = tuple(Scores(x * scale, np.zeros(2)) for x in (1.0, named, free))
-    held = HeldOut((), cast(Any, None), steps, steps[0], steps[1], steps[0], np.zeros(1), horizon_s=10.0, free=True)
+    held = HeldOut((), cast(Any, None), steps, steps[1], steps[0], np.zeros(1), horizon_s=10.0, free=True)
     assert held.free_gains(named=True) == gains
     assert [x.squares[0, 0] for x in held.without_free().steps] == [4.0, 4.0 * named]
     assert not held.without_free().free

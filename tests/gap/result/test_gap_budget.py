@@ -12,7 +12,7 @@ import avtorch
 from avtorch.errors import InputError
 from avtorch.gap import ConstantResistance, DeadBand, DeadTime, Effect, SensorBias
 from avtorch.gap.result.budget import Budget
-from avtorch.gap.result.gap_budget import shrinkage_of
+from avtorch.gap.result.gap_size import shrinkage_of
 from avtorch.gap.result.held_out import Scores
 from tests.gap.cars import log_of
 

@@ -10,10 +10,8 @@ import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.gap import DeadTime, Effect, SimulatorInput, plant
-from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.result.free_runs import CountedRows
+from avtorch.gap.result.counted_rows import BEGIN_S, HORIZON_S, CountedRows
 from avtorch.gap.result.gap_size import Simulated, gap_size
-from avtorch.gap.rollout_errors import HORIZON_S
 from avtorch.io import Log
 from avtorch.io.engagement import SETTLE_S
 from tests.gap.records import BOTH, command_over
@@ -40,7 +38,7 @@ def drive(effects: Sequence[Effect] = (), *, rate_hz: int = 20, seconds: float =
 def rows_of(log: Log, channels: Sequence[str] = BOTH) -> CountedRows:
     shown = {name: getattr(log, name) for name in channels}
     own = Log.from_arrays(time=log.time, accel_cmd=log.accel_cmd, **shown)
-    return CountedRows.of(DriveData.of(own), (own,))
+    return CountedRows.of(own)
 
 
 @pytest.mark.parametrize("rate_hz", [20, 100])
@@ -60,16 +58,21 @@ def test_one_step_is_the_hold_from_the_measured_acceleration(rate_hz: int) -> No
     assert facts.one_step_floor == facts.one_step_rmse
 
 
-def test_rollouts_begin_anew_at_every_row() -> None:
+def test_free_runs_begin_anew_at_what_was_measured() -> None:
     log, none = drive()
     rows = rows_of(log)
-    # a rollout that lags behind by 0.1 m/s every second: off by how long ago it began, which is any time up to 10 s
+    # a run that lags behind by 0.1 m/s every second: off by how long ago it began, which is any time up to 10 s
     errors: FloatArray = none.errors.copy()
     errors[-1] = 0.1 * rows.dt * np.arange(rows.rows)[:, None] + 7.0
     facts = gap_size(rows, Simulated(errors, LAG), none, detected=True)
-    ages = [rows.dt * np.arange(min(k + 1, round(HORIZON_S / rows.dt))) for k in range(rows.rows)]
-    want = np.mean([((0.1 * age) ** 2).mean() for age in ages])
-    assert facts.rollout_rmse_speed == pytest.approx(np.sqrt(want))
+    ages = rows.dt * (np.arange(rows.rows) % round(HORIZON_S / rows.dt))
+    begun = ages[: round(BEGIN_S / rows.dt)].mean()  # from the mean over half a second on
+    assert facts.rollout_rmse_speed == pytest.approx(np.sqrt(((0.1 * (ages - begun)) ** 2).mean()))
+    # of a faster log the runs are as long
+    quick = rows_of(drive(rate_hz=100)[0])
+    errors = 0.1 * quick.dt * np.arange(quick.rows * quick.group).reshape(1, quick.rows, quick.group) / quick.group
+    errors = np.concatenate([errors, errors])
+    assert quick.rms(errors)["speed"] == pytest.approx(facts.rollout_rmse_speed, rel=0.01)
     assert facts.horizon_s == HORIZON_S == 10.0
 
 

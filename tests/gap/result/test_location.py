@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avtorch.gap.drive_record import Record
 from avtorch.gap.result.attribution import RowAttribution, _q_values, localise, shortest
+from avtorch.gap.result.counted_rows import CountedRows
 from tests.bars import BAR
 from tests.gap.records import log_of
 
 
 def _shown(
-    does: np.ndarray, record: Record, *, nats: float = 200.0, felt: float = 0.0, paid: float = 10.0
+    does: np.ndarray, record: CountedRows, *, nats: float = 200.0, felt: float = 0.0, paid: float = 10.0
 ) -> RowAttribution:
     size = does / does.sum() * nats
     moved = np.stack([np.sqrt(does), np.cumsum(np.sqrt(does)) * record.dt])
@@ -20,11 +20,11 @@ def _shown(
 
 
 @pytest.fixture(scope="module")
-def record() -> Record:
-    return Record.of(log_of(seconds=120.0, speed0=8.0))
+def record() -> CountedRows:
+    return CountedRows.of(log_of(seconds=120.0, speed0=8.0))
 
 
-def test_a_speed_range_is_named_and_a_uniform_cause_is_not(record: Record) -> None:
+def test_a_speed_range_is_named_and_a_uniform_cause_is_not(record: CountedRows) -> None:
     speed = record.measured[1, :, 0]
     slow = np.quantile(speed, 0.3)
     named = localise(_shown((speed < slow) + 0.0, record), onset_s=None, lag=0.3)
@@ -35,7 +35,7 @@ def test_a_speed_range_is_named_and_a_uniform_cause_is_not(record: Record) -> No
     assert {w.axis for w in even} <= {"signal", "frequency"}
 
 
-def test_braking_is_named(record: Record) -> None:
+def test_braking_is_named(record: CountedRows) -> None:
     command = record.command
     named = localise(_shown(np.maximum(-command, 0) ** 2 + 1e-9, record), onset_s=None, lag=0.05)
     part = next(w for w in named if w.axis == "command")
@@ -43,7 +43,7 @@ def test_braking_is_named(record: Record) -> None:
     assert float(part.begin) == pytest.approx(command.min(), abs=0.3)
 
 
-def test_an_onset_is_a_part_of_the_time(record: Record) -> None:
+def test_an_onset_is_a_part_of_the_time(record: CountedRows) -> None:
     time = record.time
     named = localise(_shown((time > 70) + 0.0, record), onset_s=70.0, lag=0.3)
     part = next(w for w in named if w.axis == "time")
@@ -51,13 +51,13 @@ def test_an_onset_is_a_part_of_the_time(record: Record) -> None:
     assert part.share == pytest.approx(1.0)
 
 
-def test_what_gains_nothing_is_not_named(record: Record) -> None:
+def test_what_gains_nothing_is_not_named(record: CountedRows) -> None:
     quiet = _shown(np.ones(record.rows), record)
     assert localise(replace(quiet, gained=np.zeros(record.rows)), onset_s=30.0, lag=0.3) == ()
     assert localise(replace(quiet, gained=-quiet.gained), onset_s=30.0, lag=0.3) == ()
 
 
-def test_sensing_and_actuation_share(record: Record) -> None:
+def test_sensing_and_actuation_share(record: CountedRows) -> None:
     named = {w.begin: w.share for w in localise(_shown(np.ones(record.rows), record, felt=0.25), onset_s=None, lag=0.3)}
     assert (named["actuation"], named["sensing"]) == pytest.approx((0.75, 0.25))
 

@@ -11,7 +11,8 @@ import torch
 import avtorch
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, Effect, Parameter, plant
-from avtorch.gap.effects import Gust, SensorLag
+from avtorch.gap.effects.gust import Gust
+from avtorch.gap.effects.sensor_lag import SensorLag
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.hypotheses import implausible

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from avtorch import diagnose
 from avtorch.gap import Effect, Gust, SensorBias, plant
-from avtorch.gap.effects import Outliers
+from avtorch.gap.effects.outliers import Outliers
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.plant import GapPlant
 from tests.gap.cars import DT, log_of

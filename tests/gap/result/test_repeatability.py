@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from avtorch.gap.drive_record import Record
 from avtorch.gap.result import sentences
+from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.gap_size import SETTLED_S, WINDOW_S, GapSize, Repeatability, repeatability
 from avtorch.gap.result.hypotheses import Candidate, Verdict
@@ -41,7 +41,9 @@ def steps(seconds: float, rng: np.random.Generator) -> np.ndarray:
 def test_a_manoeuvre_driven_twice_gives_the_noise(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     manoeuvre = steps(40, rng)
-    told = repeatability(Record.of(log_of(np.concatenate([steps(20, rng), manoeuvre, steps(14, rng), manoeuvre]), rng)))
+    told = repeatability(
+        CountedRows.of(log_of(np.concatenate([steps(20, rng), manoeuvre, steps(14, rng), manoeuvre]), rng))
+    )
     assert told is not None
     assert told.pairs in (2, 3, 4)  # a window whose commands hardly move is left out
     assert told.seconds == pytest.approx(told.pairs * (WINDOW_S - SETTLED_S))
@@ -56,17 +58,17 @@ def test_a_manoeuvre_driven_twice_gives_the_noise(rotating_seed: int) -> None:
 @pytest.mark.statistical
 def test_a_manoeuvre_driven_once_gives_no_noise(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
-    assert repeatability(Record.of(log_of(steps(120, rng), rng))) is None
+    assert repeatability(CountedRows.of(log_of(steps(120, rng), rng))) is None
     # a command that stands still is no manoeuvre
-    assert repeatability(Record.of(log_of(np.full(2400, 0.1), rng))) is None
-    assert repeatability(Record.of(log_of(steps(16, rng), rng))) is None
+    assert repeatability(CountedRows.of(log_of(np.full(2400, 0.1), rng))) is None
+    assert repeatability(CountedRows.of(log_of(steps(16, rng), rng))) is None
 
 
 @pytest.mark.statistical
 def test_drives_may_repeat_each_other(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     manoeuvre = steps(30, rng)
-    told = repeatability(Record.of([log_of(manoeuvre, rng), log_of(manoeuvre, rng)]))
+    told = repeatability(CountedRows.of([log_of(manoeuvre, rng), log_of(manoeuvre, rng)]))
     assert told is not None
     assert told.pairs >= 2
 

@@ -34,11 +34,11 @@ def test_a_simulated_speed_begins_anew_every_ten_seconds_and_in_each_stretch() -
     speed, zeros = 20 + np.sin(time), np.zeros(600)
     drifting = speed + 7.0 + 0.4 * time
     traces = Traces(time, zeros, ("speed",), speed[None], drifting[None], speed[None], zeros, stretch)
-    assert [int((traces.piece == n).sum()) for n in range(4)] == [200, 200, 100, 100]
+    assert [run.stop - run.start for run in traces.runs] == [200, 200, 100, 100]
     off = traces.begun_anew(traces.before)[0] - speed
     since = np.concatenate([0.05 * (np.arange(500) % 200), 0.05 * np.arange(100)])
-    # from the mean of the first half second, 11 rows, on
-    np.testing.assert_allclose(off, 0.4 * (since - 0.25), atol=1e-9)
+    # from the mean of the first half second, 10 rows, on
+    np.testing.assert_allclose(off, 0.4 * (since - 0.225), atol=1e-9)
     np.testing.assert_allclose(traces.begun_anew(traces.after)[0], speed)
     accel = Traces(time, zeros, ("accel",), speed[None], drifting[None], speed[None], zeros, stretch)
     assert accel.begun_anew(accel.before) is accel.before

@@ -70,7 +70,7 @@ def test_all_effects_of_the_contract_with_their_keys() -> None:
         assert list(cls().report(torch.tensor(0.3, dtype=D))) == keys
         assert cls.meaning
         assert cls.equation
-        for p in cls().coordinates():
+        for p in cls.parameters:
             assert p.low < float(p.typical().reshape(-1)[0]) < p.high
 
 
@@ -204,7 +204,7 @@ def test_gradients(cls: type[Effect], start: str) -> None:
     gen = torch.Generator().manual_seed(11)
     values = {}
     for name, p in known.items():
-        z = 0.5 * torch.randn(2, *([] if p.size == 1 else [p.size]), generator=gen, dtype=D)
+        z = 0.5 * torch.randn(2, generator=gen, dtype=D)
         values[name] = p.constrain(z).requires_grad_()
     names = list(values)
 

@@ -123,7 +123,7 @@ VARIANTS = {
     "saturation": [{"accel_min_mps2": -float("inf")}],
     "second_order_actuator": [{"damping_ratio": 0.4}, {"inverse_frequency_s": 0.0, "damping_ratio": None}],
     "driveline_oscillation": [{"mode_damping": 1.4, "quadrature": -0.2}],
-    "gain_change": [{"ramp_s": 3.0, "latest_s": 90.0}],
+    "gain_change": [{"ramp_s": 3.0}],
 }
 
 
@@ -215,7 +215,6 @@ def test_a_string_that_names_a_file_is_one(tmp_path: Path, monkeypatch: pytest.M
         ("[dead_time\n", "TOML"),
         ("[dead_time]\ndelay_s = 'x'\n", "delay_s"),
         ("[gap]\n", "gap"),
-        ("[gain_change]\nearliest_s = 60.0\n", "gain_change: found earliest_s 60 and latest_s 60, needs the earliest"),
     ],
 )
 def test_wrong_text_is_refused(text: str, said: str) -> None:
@@ -240,18 +239,6 @@ def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
             SimulatorInput(**{"time": time, "command": time, **bad})  # type: ignore[arg-type]
 
 
-def test_drives_of_logs() -> None:
-    time = torch.arange(100, dtype=D).numpy() * 0.1
-    log = avtorch.Log.from_arrays(time=time, accel_cmd=0 * time + 0.5, accel=0 * time + 0.2, speed=10 + 0.5 * time)
-    drive = SimulatorInput.from_log(log)
-    assert float(drive.accel0) == 0.2  # type: ignore[arg-type]
-    assert drive.uniform
-    response = plant([gap.AerodynamicDrag()]).response(drive)
-    assert float(response.accel[0]) == pytest.approx(0.2)
-    with pytest.raises(InputError, match="segment"):
-        SimulatorInput.from_log(log, 3)
-
-
 # parameters ------------------------------------------------------------------------------------------
 
 
@@ -261,11 +248,10 @@ def test_parameters_are_standard_normals_in_z(rotating_seed: int) -> None:
         z = torch.tensor([-1.2815515655, 0.0, 1.2815515655], dtype=D)
         value = p.constrain(z)
         torch.testing.assert_close(p.unconstrain(value), z, rtol=0, atol=1e-7)
-        if p.constraint != "interval":
-            assert sorted(value[[0, 2]].tolist()) == pytest.approx([p.low, p.high], rel=1e-6)
+        assert sorted(value[[0, 2]].tolist()) == pytest.approx([p.low, p.high], rel=1e-6, abs=1e-6)
         drawn = p.sample(2000, generator=torch.Generator().manual_seed(rotating_seed))
         inside = float(((drawn > p.low) & (drawn < p.high)).double().mean())
-        assert inside == pytest.approx(1.0 if p.constraint == "interval" else 0.8, abs=0.06)
+        assert inside == pytest.approx(0.8, abs=0.06)
     car = plant()
     assert float(car.parameters()["T_L"].typical()) == pytest.approx(0.3, rel=1e-3)
     assert car.parameters()["K_L"].spread == pytest.approx(0.3, rel=1e-3)
@@ -283,8 +269,6 @@ def test_wrong_ranges_are_refused(low: float, high: float, constraint: str) -> N
 def test_settings_come_from_the_drive() -> None:
     time = torch.arange(200, dtype=D) * 0.5 + 40
     drive = SimulatorInput(time, torch.zeros_like(time), torch.full_like(time, 8.0))
-    car = plant([gap.SpeedDependentLag, gap.GainChange, gap.RoadGrade]).prepared(drive)
-    known = car.parameters()
-    assert car.effects[1] == gap.SpeedDependentLag(mean_speed=8.0)
-    assert (known["gain_change.change_s"].low, known["gain_change.change_s"].high) == (40.0, 139.5)
-    assert known["road_grade.profile"].size == int(8 * 99.5 / gap.RoadGrade().knot_m) + 4
+    car = plant([gap.SpeedDependentLag, gap.RoadGrade]).prepared(drive)
+    assert car.effects[0] == gap.SpeedDependentLag(mean_speed=8.0)
+    assert car.effects[1] == gap.RoadGrade(knots=int(8 * 99.5 / gap.RoadGrade().knot_m) + 4)

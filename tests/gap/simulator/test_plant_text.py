@@ -22,11 +22,13 @@ WRONG = {
     "overflow": ("dead_time=1e999", "dead_time.delay_s is inf"),
     "digits": ("dead_time=" + 4000 * "9", "dead_time.delay_s is inf"),
     "whole": ("T_L = " + 4000 * "9" + "\n", "T_L is inf, needs a number (0.0001 to 1000 s)"),
-    "wide_digit": ("dead_time=１", "needs a number after '='"),
-    "underscore": ("dead_time=1_0", "needs a number after '='"),
-    "twice": ("dead_time=0.1,dead_time=0.2", "found 'dead_time=0.2' besides another value, needs one"),
-    "effect_twice": ("gust,gust", "found 'gust', needs an effect's name, once"),
-    "no_parameter": ("dead_time.=1", "found '', needs one of delay_s"),
+    "wide_digit": ("dead_time=１", "found 'dead_time=１', needs effects, each once, with numbers, as dead_time=0.2"),
+    "twice": (
+        "dead_time=0.1,dead_time=0.2",
+        "found 'dead_time=0.1,dead_time=0.2', needs effects, each once",
+    ),
+    "effect_twice": ("gust,gust", "found 'gust,gust', needs effects, each once"),
+    "no_parameter": ("dead_time.=1", "found 'dead_time.=1', needs effects"),
     "true": ("[dead_time]\ndelay_s = true\n", "dead_time.delay_s: found True, needs a number"),
     "true_lag": ("T_L = true\n", "T_L: found True, needs a number"),
     "table": ("T_L = {a = 1}\n", "T_L: found {'a': 1}, needs a number"),
@@ -48,7 +50,6 @@ WRONG = {
     "deep": ("a = " + 5000 * "[" + "\n", "nested too deeply"),
     "dots": (20_000 * "a." + "a = 1\n", "more than 64 dots"),
     "huge": ("#" + 1_000_000 * " " + "\n", "needs 1,000,000 at most"),
-    "long_words": ("dead_time=0.2" + 20_000 * " " + ",gust", "needs 10,000 at most"),
     "long_name": (9000 * "x" + "=1", "(8960 more characters)"),
 }
 
@@ -100,14 +101,14 @@ def test_draws_of_every_prior_come_back_from_text(cls: type[Effect], fresh_seed:
     """A thousand typical ranges are wide enough for whatever a fit finds: draws of the prior, and six of its SDs."""
     generator = torch.Generator().manual_seed(fresh_seed)
     for _ in range(20):
-        values = {p.name: p.sample(generator=generator) for p in cls().coordinates() if p.name != "change_s"}
+        values = {p.name: p.sample(generator=generator) for p in cls.parameters if p.name != "change_s"}
         car = plant([cls().replaced(values)])
         again = GapPlant.from_toml(car.to_toml())
         assert again.to_toml() == car.to_toml()
         for name, value in car.values().items():
             assert torch.equal(again.values()[name], value), name
     for z in (-6.0, 6.0):
-        values = {p.name: p.constrain(torch.full(p.typical().shape, z)) for p in cls().coordinates()}
+        values = {p.name: p.constrain(torch.full(p.typical().shape, z)) for p in cls.parameters}
         car = plant([cls().replaced({k: v.double() for k, v in values.items() if k != "change_s"})])
         assert GapPlant.from_toml(car.to_toml()).to_toml() == car.to_toml()
 
@@ -143,7 +144,7 @@ def test_the_command_line_reports_it_in_one_line(tmp_path: Path, capsys: pytest.
         lines = capsys.readouterr().err.splitlines()
         assert (code, len(lines)) == (2, 1)
         assert lines[0].isprintable()
-        assert len(lines[0]) < 600
+        assert len(lines[0]) < 700
 
 
 def test_a_domain_of_a_parameter_holds_its_typical_range() -> None:
