@@ -11,7 +11,7 @@ from avtorch.errors import InputError
 from avtorch.inference.belief import Belief
 from avtorch.inference.device import Device, checked_device, generator_on
 from avtorch.inference.form import Rows, WindowLikelihood
-from avtorch.inference.priors import Joint, Prior, default_actuation_prior, prior_on
+from avtorch.inference.priors import Joint, Prior, default_actuation_prior
 from avtorch.inference.state import about, shaped_as
 
 
@@ -45,7 +45,7 @@ class Estimator(ABC):
             raise InputError(f"kept, vehicles: found {kept}, {vehicles}, need 2 or more draws and 1 or more vehicles")
         self.kept, self.vehicles, self.device = kept, vehicles, checked_device(device)
         actuation = default_actuation_prior() if actuation_prior is None else actuation_prior
-        self.first_prior = Joint(prior_on(actuation, self.device), prior_on(noise_prior, self.device))
+        self.first_prior = Joint(actuation, noise_prior).to(self.device)
         self.generator = generator_on(self.device, seed)
         self.belief = Belief.of_prior(names, self.first_prior, kept, vehicles, self.generator)
         self._memory: dict[str, Tensor] = {}  # one entry a vehicle

@@ -15,10 +15,11 @@ import math
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Bool, Float, Int
+from avtorch.arrays import Bool, Float, FloatArray, Int
 from avtorch.errors import InputError
 from avtorch.inference.density import Density
 from avtorch.inference.device import check_generator
@@ -34,11 +35,6 @@ def reliable(draws: int) -> float:
     return min(1 - 1 / math.log10(draws), RELIABLE) if draws > 10 else -math.inf
 
 
-def tail_of(n: int) -> int:
-    """How many of ``n`` ratios are their tail."""
-    return max(5, math.ceil(min(n / 5, 3 * n**0.5)))
-
-
 def pareto_k(log_ratio: Float[Tensor, "draw window"]) -> Float[Tensor, " window"]:
     """Shape ``k`` of the tail of ratios given by their logarithm ``(draw, window)``; returns ``(window,)``.
 
@@ -46,30 +42,33 @@ def pareto_k(log_ratio: Float[Tensor, "draw window"]) -> Float[Tensor, " window"
     in Pareto-smoothed importance sampling (Vehtari et al., JMLR 25(72), 2024). Infinite where a ratio is NaN or all
     are zero; minus infinity where the largest are all alike.
     """
-    tail = tail_of(len(log_ratio))
-    largest = log_ratio.masked_fill(log_ratio.isnan(), -torch.inf).topk(tail + 1, 0).values
-    broken = log_ratio.isnan().any(0) | ~largest[0].isfinite()
-    ratio = (largest - largest[0]).exp().nan_to_num(nan=0.0)
-    excess = (ratio[:-1] - ratio[-1]).flip(0)  # ascending
-    alike = excess[-1] < 1e-12
-    k = _shape(torch.where(alike, 1.0, excess))
-    return k.masked_fill(alike, -torch.inf).masked_fill(broken, torch.inf)
+    tail = max(5, math.ceil(min(len(log_ratio) / 5, 3 * len(log_ratio) ** 0.5)))
+    lost = log_ratio.isnan()
+    largest = log_ratio.masked_fill(lost, -torch.inf).topk(tail + 1, 0).values.double().cpu().numpy()
+    with np.errstate(all="ignore"):  # where all are zero, or alike
+        ratio = np.nan_to_num(np.exp(largest - largest[0]), nan=0.0)
+        excess = (ratio[:-1] - ratio[-1])[::-1]  # ascending
+        alike = excess[-1] < 1e-12
+        k = np.where(alike, -np.inf, _shape(np.where(alike, 1.0, excess)))
+    k[lost.any(0).cpu().numpy() | ~np.isfinite(largest[0])] = np.inf
+    return torch.from_numpy(k).to(log_ratio)
 
 
-def _shape(x: Tensor) -> Tensor:
+def _shape(x: FloatArray) -> FloatArray:
     """Shape of a generalised Pareto law (Zhang and Stephens, Technometrics 51, 2009); ``x`` ``(n, window)`` rises.
 
     The posterior mean over a grid of its other parameter, and a weak prior at 0.5 that weighs as much as ten ratios.
     """
     n = len(x)
     count = 30 + int(n**0.5)
-    steps = 1 - (count / (torch.arange(1, count + 1, dtype=x.dtype, device=x.device) - 0.5)).sqrt()
-    quarter = x[int(n / 4 + 0.5) - 1].clamp_min(1e-300)
+    steps = 1 - np.sqrt(count / (np.arange(1, count + 1) - 0.5))
+    quarter = np.maximum(x[int(n / 4 + 0.5) - 1], 1e-300)
     b = steps[:, None] / (3 * quarter) + 1 / x[-1]
-    k = torch.log1p(-b[:, None] * x).mean(1)
-    profile = n * ((-b / k).log() - k - 1)
-    b = (profile.nan_to_num(nan=-torch.inf).softmax(0) * b).sum(0)
-    return (n * torch.log1p(-b * x).mean(0) + 5) / (n + 10)
+    k = np.log1p(-b[:, None] * x).mean(1)
+    profile = np.nan_to_num(n * (np.log(-b / k) - k - 1), nan=-np.inf)
+    weight = np.exp(profile - profile.max(0))
+    b = (weight * b).sum(0) / weight.sum(0)
+    return (n * np.log1p(-b * x).mean(0) + 5) / (n + 10)
 
 
 @runtime_checkable

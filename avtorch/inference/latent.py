@@ -16,11 +16,11 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int, Real
 from avtorch.errors import InputError
-from avtorch.inference.compiled import Unavailable, load_kernels
+from avtorch.inference.compiled import load_kernels
 from avtorch.inference.device import Device
 from avtorch.inference.form import Rows, WindowLikelihood
 from avtorch.inference.latent_model import ACCEL_SD0, SPEED_SD0, latent_log_likelihood
-from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior, prior_on
+from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior
 from avtorch.inference.sampler_settings import SamplerSettings
 
 #: A step longer than this many median steps is a gap: the filter starts afresh behind it.
@@ -217,7 +217,7 @@ def compiled_log_likelihood(
     Arguments as of `latent_log_likelihood`; None where nothing can be compiled here.
     """
     kernels = load_kernels("latent_kernels")
-    if isinstance(kernels, Unavailable):
+    if kernels is None:
         return None
     zero, device = torch.zeros_like(T_L), T_L.device
     six = (T_L, K_L, process_noise, zero if road_noise is None else road_noise, coloured_sd, coloured_time)
@@ -263,7 +263,7 @@ class LatentDensity:
         self.data = data
         self.names = latent_names(accel=data.accel is not None, speed=data.speed is not None)
         own = Joint(default_actuation_prior(), default_noise_prior(self.names[2:])) if prior is None else prior
-        self.prior = prior_on(own, data.time.device)
+        self.prior = own.to(data.time.device)
         self._runs, self._owner = data.runs()
         self._steps = even_steps(self._runs)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,11 +13,12 @@ from avtorch.arrays import Bool, Float
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.inference.arviz_export import UNITS, inference_data, parameter_table
-from avtorch.inference.exactness import Exactness
 
 if TYPE_CHECKING:
     import pandas
     from arviz import InferenceData
+
+    from avtorch.inference.exactness import Exactness
 
 SHOWN = 2
 """Windows whose parameters a posterior shows of itself."""
@@ -132,7 +134,7 @@ class Posterior(Displayed):
 
     def quantile(self, q: float) -> Float[Tensor, "window parameter"]:
         """Posterior quantiles, ``(window, parameter)``."""
-        return quantile_of(self.flat, q)
+        return quantiles_of(self.flat, q)[0]
 
     def log_moments(self) -> tuple[Float[Tensor, "window parameter"], Float[Tensor, "window parameter parameter"]]:
         """Mean ``(window, parameter)`` and covariance ``(window, parameter, parameter)`` of the log parameters."""
@@ -141,22 +143,14 @@ class Posterior(Displayed):
         return z.mean(0), torch.einsum("nwi,nwj->wij", centred, centred) / (len(z) - 1)
 
 
-def quantile_of(draws: Float[Tensor, "draw *rest"], q: float) -> Float[Tensor, "*rest"]:
-    """Quantile along the first dimension, linear between order statistics; no more is sorted than is needed."""
-    count = len(draws)
-    position = q * (count - 1)
-    low = int(position)
-    high = min(low + 1, count - 1)
-    if high < count // 4:
-        below = draws.topk(high + 1, 0, largest=False).values
-        pair = below[low], below[high]
-    elif low > count - count // 4:
-        above = draws.topk(count - low, 0).values
-        pair = above[count - 1 - low], above[count - 1 - high]
-    else:
-        ordered = draws.sort(0).values
-        pair = ordered[low], ordered[high]
-    return torch.lerp(*pair, position - low)
+def quantiles_of(draws: Float[Tensor, "draw *rest"], *q: float) -> tuple[Float[Tensor, "*rest"], ...]:
+    """Quantiles along the first dimension, linear between order statistics; no more is sorted than is needed."""
+    position = np.array(q) * (len(draws) - 1)
+    low = position.astype(int)
+    high = np.minimum(low + 1, len(draws) - 1)
+    ordered = np.partition(draws.movedim(0, -1).cpu().numpy(), np.union1d(low, high), axis=-1)
+    found = ordered[..., low] + (position - low) * (ordered[..., high] - ordered[..., low])
+    return torch.from_numpy(found).to(draws).unbind(-1)
 
 
 def nested_rhat(draws: Float[Tensor, "chain draw *rest"], groups: int = 8) -> Float[Tensor, "*rest"]:
@@ -166,19 +160,22 @@ def nested_rhat(draws: Float[Tensor, "chain draw *rest"], groups: int = 8) -> Fl
     autocorrelation times each is large even at stationarity. A common drift shows up between the halves, a chain in
     another place between the groups.
     """
-    chains, count = draws.shape[:2]
-    groups = max(1, min(groups, chains))
-    members, half = chains // groups, count // 2
-    used = draws[: groups * members, : 2 * half]
-    used = used - used[0, 0]  # near zero the sums below keep their digits
-    means, squares = [], []
-    for part in used.split(half, 1):
-        for table, x in ((means, part), (squares, part.square())):
-            table.append(x.sum(1).unflatten(0, (groups, members)).sum(1) / (members * half))
-    mean = torch.cat(means)  # (half x group, ...)
-    within = (torch.cat(squares) - mean.square()).mean(0)
-    between = mean.var(0)
-    return (1 + between / within.clamp_min(torch.finfo(draws.dtype).tiny)).sqrt()
+    half = draws.shape[1] // 2
+    used = (draws[:, : 2 * half] - draws[0, 0]).movedim((0, 1), (-1, -2))  # near zero the sums keep their digits
+    sums, squares = (x.unflatten(-2, (2, half)).sum(-2) for x in (used, used.square()))
+    return rhat_of_halves(sums, squares, half, groups)
+
+
+def rhat_of_halves(
+    sums: Float[Tensor, "*rest 2 chain"], squares: Float[Tensor, "*rest 2 chain"], half: int, groups: int = 8
+) -> Float[Tensor, "*rest"]:
+    """As :func:`nested_rhat`, from the sums over the ``half`` draws of each chain's halves, and of their squares."""
+    groups = min(groups, sums.shape[-1])
+    members = sums.shape[-1] // groups
+    each = (x[..., : groups * members].unflatten(-1, (groups, members)).sum(-1) for x in (sums, squares))
+    mean, square = (x.flatten(-2) / (members * half) for x in each)
+    within = (square - mean.square()).mean(-1)
+    return (1 + mean.var(-1) / within.clamp_min(torch.finfo(mean.dtype).tiny)).sqrt()
 
 
 def normal_scores(draws: Float[Tensor, "chain draw *rest"]) -> Float[Tensor, "chain draw *rest"]:

@@ -14,7 +14,7 @@ from avtorch.inference.belief import Belief, Summary
 from avtorch.inference.density import Density
 from avtorch.inference.estimator import Estimator
 from avtorch.inference.form import Rows, WindowLikelihood
-from avtorch.inference.posterior import quantile_of
+from avtorch.inference.posterior import quantiles_of
 from avtorch.inference.priors import (
     Joint,
     LogSpaceNormal,
@@ -128,7 +128,7 @@ class SequentialInference(Estimator):
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
         """Posterior of some vehicles: its summary, log moments, and where it converged ``(vehicle,)`` bool."""
         posterior = sample(density, self.settings, generator=self.generator)
-        quantiles = quantile_of(posterior.flat, 0.05), quantile_of(posterior.flat, 0.95)
+        quantiles = quantiles_of(posterior.flat, 0.05, 0.95)
         draws = _thin(posterior.flat, self.kept)
         summary = Summary(posterior.mean, posterior.sd, *quantiles, draws)
         return summary, *posterior.log_moments(), posterior.converged
