@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Bool, Float, FloatArray, Int
+from avtorch.arrays import Bool, Float, FloatArray
 from avtorch.errors import InputError
 from avtorch.inference.density import Density
 from avtorch.inference.device import check_generator
@@ -69,13 +69,6 @@ def _shape(x: FloatArray) -> FloatArray:
     weight = np.exp(profile - profile.max(0))
     b = (weight * b).sum(0) / weight.sum(0)
     return (n * np.log1p(-b * x).mean(0) + 5) / (n + 10)
-
-
-@runtime_checkable
-class ApproximatedDensity(Density, Protocol):
-    """A density with a cheaper one near it, in which proposals are sought; the weights remain those of the exact."""
-
-    def approximation(self) -> Density: ...
 
 
 @dataclass(frozen=True)
@@ -150,21 +143,13 @@ class WeightedDraws:
 
     def equal(self, count: int, generator: torch.Generator) -> Float[Tensor, "count window parameter"]:
         """``count`` equally weighted draws of ``z``, by systematic resampling; a heavy draw comes more than once."""
-        # in random order, so that any leading stretch is a sample
-        return _picked(
-            self.z, self.systematic(count, generator)[torch.randperm(count, generator=generator, device=self.z.device)]
-        )
-
-    def systematic(self, count: int, generator: torch.Generator | None) -> Int[Tensor, "count window"]:
-        """Which draw each of ``count`` equally weighted ones is, by systematic resampling."""
         like: dict[str, Any] = {"dtype": self.z.dtype, "device": self.z.device}
         begin = torch.rand(self.z.shape[1], 1, generator=generator, **like)
         at = (torch.arange(count, **like) + begin) / count
-        return torch.searchsorted(self.weight.cumsum(0).mT.contiguous(), at).clamp_max(len(self.z) - 1).mT
-
-
-def _picked(z: Tensor, index: Tensor) -> Tensor:
-    return z.gather(0, index[..., None].expand(-1, -1, z.shape[-1]))
+        index = torch.searchsorted(self.weight.cumsum(0).mT.contiguous(), at).clamp_max(len(self.z) - 1).mT
+        # in random order, so that any leading stretch is a sample
+        index = index[torch.randperm(count, generator=generator, device=self.z.device)]
+        return self.z.gather(0, index[..., None].expand(-1, -1, self.z.shape[-1]))
 
 
 class _Mixture:
@@ -205,11 +190,6 @@ class _Mixture:
         return -0.5 * (nu + d) * torch.log1p(distance / nu) - log_det
 
 
-def approximated(density: Density) -> Density:
-    """The density near this one in which proposals are sought; itself where it has none."""
-    return density.approximation() if isinstance(density, ApproximatedDensity) else density
-
-
 @torch.no_grad()
 def weighted_draws(
     density: Density,
@@ -220,44 +200,9 @@ def weighted_draws(
 ) -> WeightedDraws:
     """Weighted draws from the posterior of every window, with proposals around ``mode``, sought where not given."""
     settings = ImportanceSettings() if settings is None else settings
-    nearby = approximated(density)
-    mode = find_mode(nearby, from_values=True, tolerance=5e-5) if mode is None else mode
+    mode = find_mode(density, from_values=True, tolerance=5e-5) if mode is None else mode
     check_generator(generator, mode.z.device)
-    mean, root = mode.z, mode.scale
-    if nearby is density:
-        return _adapted(density, settings, mean, root, generator)
-    near = _adapted(nearby, settings, mean, root, generator)
-    found = _corrected(density, nearby, near, settings, generator)
-    if bool(found.converged(settings).all()):
-        return found
-    return _adapted(density, settings, *_fitted(near.z, near.weight, root), generator)
-
-
-def _corrected(
-    density: Density,
-    nearby: Density,
-    near: WeightedDraws,
-    settings: ImportanceSettings,
-    generator: torch.Generator | None,
-) -> WeightedDraws:
-    """Draws from the density nearby, made equal in weight, with the weight that turns them into the exact one's.
-
-    A draw that came more than once weighs as often, but counts as one among the effective draws.
-    """
-    count = 2 * settings.draws
-    index = near.systematic(count, generator)
-    z = _picked(near.z, index)
-    log_ratio = density.log_prob(z) - nearby.log_prob(z)
-    log_ratio = torch.where(log_ratio.isfinite(), log_ratio, -torch.inf)
-    weight = log_ratio.softmax(0)
-    shared = torch.zeros_like(near.weight).scatter_add(0, index, weight)
-    return WeightedDraws(z, weight, torch.maximum(pareto_k(log_ratio), near.pareto_k), 1 / shared.square().sum(0))
-
-
-def _adapted(
-    density: Density, settings: ImportanceSettings, mean: Tensor, root: Tensor, generator: torch.Generator | None
-) -> WeightedDraws:
-    mixture = _Mixture(settings)
+    mean, root, mixture = mode.z, mode.scale, _Mixture(settings)
     z, target = mean.new_empty(0, *mean.shape), mean.new_empty(0, len(mean))
     for k in range(settings.rounds):
         if k:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -236,9 +235,7 @@ def compiled_log_likelihood(
     return torch.from_numpy(found.T.copy()).reshape(T_L.shape).to(device)
 
 
-def even_steps(
-    runs: LatentWindow, *, most_steps: float = EVEN_STEPS, most_s: float = EVEN_S
-) -> Float[Tensor, " run"] | None:
+def even_steps(runs: LatentWindow) -> Float[Tensor, " run"] | None:
     """The step ``(run,)`` [s] of even rows, or None where a row is further off its run's grid than both bounds."""
     count = runs.mask.sum(-1)
     index = torch.arange(runs.time.shape[1], dtype=torch.float64, device=runs.time.device)
@@ -247,7 +244,7 @@ def even_steps(
     # A run of a single row has no step; any value will do.
     dt = torch.where(count > 1, dt, dt[count > 1].median() if bool((count > 1).any()) else 0.01)
     off = (runs.time - runs.time[:, :1] - dt[:, None] * index).abs() * runs.mask
-    return None if bool((off > (most_steps * dt[:, None]).clamp(max=most_s)).any()) else dt
+    return None if bool((off > (EVEN_STEPS * dt[:, None]).clamp(max=EVEN_S)).any()) else dt
 
 
 class LatentDensity:
@@ -282,16 +279,6 @@ class LatentDensity:
         if len(self._owner) == self.windows:
             return per_run
         return per_run.new_zeros(*per_run.shape[:-1], self.windows).index_add(-1, self._owner, per_run)
-
-    def approximation(self) -> LatentDensity:
-        """The same law with rows moved to an even grid where none of them moves by a step, for `weighted_draws`: this
-        density itself where its rows are even, or too uneven."""
-        steps = None if self._steps is not None else even_steps(self._runs, most_steps=1.0, most_s=torch.inf)
-        if steps is None:
-            return self
-        near = copy(self)
-        near._steps = steps
-        return near
 
     def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
         return self.log_likelihood(z) + self.prior.log_prob(z)

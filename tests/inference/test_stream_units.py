@@ -234,7 +234,7 @@ def test_the_memory_of_a_stretch_is_bounded():
         usable = torch.ones(1, 200, dtype=torch.bool)
         found.take({"time": time + 2.0 * k, "usable": usable, **dict.fromkeys(JERK, zero)}, {})
         kept.append(found.rows["time"].shape[-1] if found.rows else 0)
-    assert max(kept) < 40 / 0.05 + 50
+    assert max(kept) < 40 / 0.01 + 250
 
 
 @pytest.mark.parametrize("lap", [1, 2, 3])
