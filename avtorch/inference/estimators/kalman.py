@@ -26,7 +26,7 @@ from torch import Tensor
 from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.inference.belief import Summary
-from avtorch.inference.estimators.windowed import WindowedEstimator
+from avtorch.inference.estimator import WindowedEstimator
 from avtorch.inference.form import Form, JerkForm, Rows
 from avtorch.inference.jerk import JerkStatistics
 from avtorch.inference.latent import GAP, NOISE_PRIOR, LatentForm
