@@ -166,6 +166,6 @@ class Belief(Displayed):
     def of_prior(cls, names: tuple[str, ...], prior: Prior, kept: int, vehicles: int, g: torch.Generator) -> Belief:
         """The belief before any window: ``kept`` draws of the prior, from the generator ``g``."""
         draws = prior.sample(kept, vehicles, generator=g).exp()
-        quantiles = quantiles_of(draws, 0.05, 0.95)
+        q05, q95 = quantiles_of(draws, 0.05, 0.95)
         never = torch.zeros(vehicles, dtype=torch.bool, device=draws.device)
-        return cls(names, draws.mean(0), draws.std(0), *quantiles, draws, excited=never, converged=~never)
+        return cls(names, draws.mean(0), draws.std(0), q05, q95, draws, excited=never, converged=~never)

@@ -103,15 +103,15 @@ def find_mode(
     """
     begin = (density.initial() if start is None else start).detach()
 
-    def expand(z: FloatArray) -> Expansion:
+    by_values = from_values or has_quick_values(density)
+
+    def by_differences(z: FloatArray) -> Expansion:
         place = torch.from_numpy(z).to(begin)
         found = _from_values(density, place) if by_values else _from_score(density, place)
         potential, gradient, hessian = (x.detach().double().cpu().numpy() for x in found)
         return _finite(potential, gradient, hessian)
 
-    by_values = from_values or has_quick_values(density)
-    if has_form(density) and not by_values:
-        expand = _of_form(density.exponential_form)
+    expand = _of_form(density.exponential_form) if has_form(density) and not by_values else by_differences
     z, (potential, gradient, hessian) = _ascend(expand, begin.double().cpu().numpy(), iterations, tolerance)
     eigenvalues, basis = np.linalg.eigh(hessian)
     curvature = np.maximum(np.abs(eigenvalues), FLAT)
@@ -119,9 +119,9 @@ def find_mode(
     converged = (eigenvalues > 0).all(-1) & (decrement < 1e-4) & np.isfinite(potential)
     root = basis / np.sqrt(curvature)[:, None, :]
     # its triangular form without squaring it, which would lose half the digits of a narrow posterior
-    scale = np.linalg.qr(root.transpose(0, 2, 1), mode="r").transpose(0, 2, 1)
-    numbers = (torch.from_numpy(np.ascontiguousarray(x)).to(begin) for x in (z, scale, -potential))
-    return Mode(*numbers, torch.from_numpy(converged).to(begin.device))
+    scale = torch.from_numpy(np.asarray(np.linalg.qr(root.transpose(0, 2, 1), mode="r"))).mT.contiguous()
+    place, log_prob = torch.from_numpy(z).to(begin), torch.from_numpy(-potential).to(begin)
+    return Mode(place, scale.to(begin), log_prob, torch.from_numpy(converged).to(begin.device))
 
 
 def _ascend(
@@ -144,8 +144,9 @@ def _ascend(
             new = expand(trial)
             better: BoolArray = new[0] <= potential
             z = np.where(better[:, None], trial, z)
-            shapes = (better, better[:, None], better[:, None, None])
-            now = tuple(np.where(*each) for each in zip(shapes, new, now, strict=True))
+            potential = np.where(better, new[0], potential)
+            gradient = np.where(better[:, None], new[1], gradient)
+            now = potential, gradient, np.where(better[:, None, None], new[2], hessian)
             damping = np.where(better, np.minimum(2 * damping, 1.0), 0.25 * damping)
     return z, now
 

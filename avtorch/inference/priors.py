@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -56,7 +56,7 @@ class Prior(ABC):
     def device(self) -> torch.device:
         return next(x.device for x in self._given() if isinstance(x, Tensor | Prior))
 
-    def to(self, device: torch.device) -> Prior:
+    def to(self, device: torch.device) -> Self:
         """The prior on a device."""
         if self.device == device:
             return self

@@ -128,9 +128,9 @@ class SequentialInference(Estimator):
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
         """Posterior of some vehicles: its summary, log moments, and where it converged ``(vehicle,)`` bool."""
         posterior = sample(density, self.settings, generator=self.generator)
-        quantiles = quantiles_of(posterior.flat, 0.05, 0.95)
+        q05, q95 = quantiles_of(posterior.flat, 0.05, 0.95)
         draws = _thin(posterior.flat, self.kept)
-        summary = Summary(posterior.mean, posterior.sd, *quantiles, draws)
+        summary = Summary(posterior.mean, posterior.sd, q05, q95, draws)
         return summary, *posterior.log_moments(), posterior.converged
 
     def state_dict(self) -> dict[str, Any]:

@@ -130,8 +130,8 @@ class StreamUnits:
         swapped."""
         if not {"accel_cmd", "accel", "jerk"} <= set(self.columns):
             return
-        rows = (torch.from_numpy(self.rows[name]) for name in ("accel", "accel_cmd", "jerk"))
-        statistics = JerkStatistics.from_samples(*rows, torch.from_numpy(self.rows["usable"] > 0))
+        a, u, jerk = (torch.from_numpy(self.rows[name]) for name in ("accel", "accel_cmd", "jerk"))
+        statistics = JerkStatistics.from_samples(a, u, jerk, torch.from_numpy(self.rows["usable"] > 0))
         lag, gain, noise = statistics.least_squares()
         determinant = (statistics.aa * statistics.uu - statistics.au.square()).clamp_min(1e-300)
         enough = noise.square() * statistics.n < 0.1 * statistics.jj
