@@ -184,47 +184,38 @@ def run_log_likelihood(
 
     Where a gradient is asked for by the filter in torch, otherwise the same number by the compiled one.
     """
-    noise = {name: (p[name].square() + FINEST**2).sqrt() for name in ("accel_noise", "speed_noise") if name in p}
-    noise |= {name: p[name] for name in ("road_noise",) if name in p}
-    five = (p["T_L"], p["K_L"], p["process_noise"], p["coloured_sd"], p["coloured_time"])
-    if not (torch.is_grad_enabled() and any(x.requires_grad for x in (*five, *noise.values()))):
-        values = compiled_log_likelihood(*five, runs, steps, **noise)
-        if values is not None:
-            return values
+    sensors = ("accel_noise", "speed_noise")
+    p = {name: (x.square() + FINEST**2).sqrt() if name in sensors else x for name, x in p.items()}
+    graph = torch.is_grad_enabled() and any(x.requires_grad for x in p.values())
+    values = None if graph else compiled_log_likelihood(p, runs, steps)
+    if values is not None:
+        return values
     time = runs.time
     if steps is not None:
         time = steps[:, None] * torch.arange(time.shape[1], dtype=torch.float64, device=time.device)
-    return latent_log_likelihood(*five, time, runs.u, mask=runs.mask, accel=runs.accel, speed=runs.speed, **noise)
+    return latent_log_likelihood(**p, time=time, u=runs.u, mask=runs.mask, accel=runs.accel, speed=runs.speed)
 
 
 @torch.no_grad()
 def compiled_log_likelihood(
-    T_L: Float[Tensor, "*draw run"],
-    K_L: Float[Tensor, "*draw run"],
-    process_noise: Float[Tensor, "*draw run"],
-    coloured_sd: Float[Tensor, "*draw run"],
-    coloured_time: Float[Tensor, "*draw run"],
-    runs: LatentWindow,
-    steps: Float[Tensor, " run"] | None,
-    *,
-    accel_noise: Float[Tensor, "*draw run"] | None = None,
-    speed_noise: Float[Tensor, "*draw run"] | None = None,
-    road_noise: Float[Tensor, "*draw run"] | None = None,
+    p: dict[str, Float[Tensor, "*draw run"]], runs: LatentWindow, steps: Float[Tensor, " run"] | None
 ) -> Float[Tensor, "*draw run"] | None:
-    """Log likelihood ``(..., run)`` [nats] with no gradient, on the processor; NaN where digits are lost.
+    """As :func:`run_log_likelihood`, with no gradient, on the processor; NaN where digits are lost.
 
-    Arguments as of `latent_log_likelihood`; None where nothing can be compiled here.
+    None where nothing can be compiled here.
     """
     kernels = load_kernels("latent_kernels")
     if kernels is None:
         return None
-    zero, device = torch.zeros_like(T_L), T_L.device
-    six = (T_L, K_L, process_noise, zero if road_noise is None else road_noise, coloured_sd, coloured_time)
-    two = (zero if x is None else x.square() for x in (speed_noise, accel_noise))
-    given = torch.stack((*six, *two)).reshape(8, -1, T_L.shape[-1]).movedim(-1, 0).cpu().contiguous().numpy()
+    like = p["T_L"]
+    zero, device = torch.zeros_like(like), like.device
+    names = ("T_L", "K_L", "process_noise", "road_noise", "coloured_sd", "coloured_time")
+    variances = [p.get(name, zero).square() for name in ("speed_noise", "accel_noise")]
+    given = torch.stack([*(p.get(name, zero) for name in names), *variances])
+    given = given.reshape(8, -1, like.shape[-1]).movedim(-1, 0).cpu().contiguous().numpy()
     rows = runs if device.type == "cpu" else runs.to("cpu")
-    speed = None if speed_noise is None or rows.speed is None else (rows.speed - rows.speed[:, :1]).numpy()
-    accel = None if accel_noise is None or rows.accel is None else rows.accel.numpy()
+    speed = None if "speed_noise" not in p or rows.speed is None else (rows.speed - rows.speed[:, :1]).numpy()
+    accel = None if "accel_noise" not in p or rows.accel is None else rows.accel.numpy()
     time, u, none = rows.time.numpy(), rows.u.numpy(), np.empty(0)
     found = np.empty((len(u), given.shape[2]))
     for run, count in enumerate(rows.mask.sum(-1).tolist()):
@@ -232,7 +223,7 @@ def compiled_log_likelihood(
         signals = (none if x is None else x[run, :count] for x in (speed, accel))
         parameters = (given[run, :6], given[run, 6:], SPEED_SD0, ACCEL_SD0)
         kernels.filtered(found[run], *parameters, dt, steps is not None, u[run, :count], *signals)
-    return torch.from_numpy(found.T.copy()).reshape(T_L.shape).to(device)
+    return torch.from_numpy(found.T.copy()).reshape(like.shape).to(device)
 
 
 def even_steps(runs: LatentWindow) -> Float[Tensor, " run"] | None:

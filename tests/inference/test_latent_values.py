@@ -32,6 +32,11 @@ def parameters(generator: torch.Generator, *shape: int) -> tuple[tuple[Tensor, .
     return tuple(five), {"accel_noise": accel, "speed_noise": speed, "road_noise": road}
 
 
+def named(five: tuple[Tensor, ...], noise: dict[str, Tensor]) -> dict[str, Tensor]:
+    names = ("T_L", "K_L", "process_noise", "coloured_sd", "coloured_time")
+    return dict(zip(names, five, strict=True)) | noise
+
+
 @CHANNELS
 @pytest.mark.parametrize("jitter", [0.0, 0.4, 1.9])
 @pytest.mark.parametrize("draws", [1, 8, 19])
@@ -47,7 +52,7 @@ def test_compiled_values_equal_those_of_the_filter(channels: str, jitter: float,
     assert (even is None) == (jitter > 0)
     five, noise = parameters(generator, draws, 2)
     given = {name: x for name, x in noise.items() if channels == "both" or channels in name or name == "road_noise"}
-    found = compiled_log_likelihood(*five, runs, even, **given)
+    found = compiled_log_likelihood(named(five, given), runs, even)
     exact = latent_log_likelihood(*five, runs.time, u, mask=used, **measured, **noise)
     torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-8)
 
@@ -57,7 +62,7 @@ def test_compiled_values_of_a_single_row(fresh_seed: int) -> None:
     u, measured = signals("both", 1, 1, generator)
     runs = LatentWindow(torch.zeros(1, 1, dtype=torch.float64), u, mask=torch.ones(1, 1, dtype=torch.bool), **measured)
     five, noise = parameters(generator, 3, 1)
-    found = compiled_log_likelihood(*five, runs, None, **noise)
+    found = compiled_log_likelihood(named(five, noise), runs, None)
     exact = latent_log_likelihood(*five, runs.time, u, **measured, **noise)
     torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-8)
 
@@ -70,9 +75,9 @@ def test_compiled_values_say_where_there_is_none(fresh_seed: int) -> None:
         0.02 * torch.arange(50, dtype=torch.float64)[None], u, mask=torch.ones(1, 50, dtype=torch.bool), **measured
     )
     five, noise = parameters(generator, 9, 1)
-    before = compiled_log_likelihood(*five, runs, even_steps(runs), **noise)
+    before = compiled_log_likelihood(named(five, noise), runs, even_steps(runs))
     five[0][4] = torch.nan
-    after = compiled_log_likelihood(*five, runs, even_steps(runs), **noise)
+    after = compiled_log_likelihood(named(five, noise), runs, even_steps(runs))
     assert bool(after[4].isnan().all())
     others = torch.arange(9) != 4
     assert torch.equal(before[others], after[others])
