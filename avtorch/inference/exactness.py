@@ -237,7 +237,7 @@ class Moments(NamedTuple):
         square, flat = centred.square(), centred.flatten(2)
         covariance = flat @ flat.mT / (flat.shape[-1] - 1)
         variance = covariance.diagonal(dim1=-2, dim2=-1)
-        share = (square > TAIL**2 * variance[..., None, None]).flatten(2).count_nonzero(-1) / flat.shape[-1]
+        beyond = (square > TAIL**2 * variance[..., None, None]).flatten(2).count_nonzero(-1)
         pieces = 2 if chains >= 16 else 2 * max(1, min(draws // 4, -(-8 // chains)))
         long = draws // pieces
         of_piece = torch.eye(pieces, dtype=z.dtype, device=z.device).repeat_interleave(long, 1)
@@ -250,7 +250,7 @@ class Moments(NamedTuple):
         of_mean, of_sd = each / (variance * count).sqrt(), 0.5 * each_square / variance / count**0.5
         lower, failed = torch.linalg.cholesky_ex(covariance.nan_to_num())
         lower = torch.where((failed == 0)[:, None, None], lower, torch.nan)
-        return cls(rhat, mean, lower, share, of_mean, of_sd)
+        return cls(rhat, mean, lower, beyond.to(z) / flat.shape[-1], of_mean, of_sd)
 
     def select(self, index: Int[Tensor, " chosen"]) -> Moments:
         """The windows named by ``index``."""
