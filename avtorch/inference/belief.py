@@ -12,8 +12,8 @@ from avtorch.arrays import Bool, Float, Int
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.inference.arviz_export import UNITS, inference_data, parameter_table
+from avtorch.inference.chains import quantiles_of
 from avtorch.inference.device import Device
-from avtorch.inference.posterior import quantiles_of
 from avtorch.inference.priors import Prior
 from avtorch.inference.state import shaped_as
 

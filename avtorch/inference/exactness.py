@@ -22,12 +22,12 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
+from avtorch.inference.chains import rhat_of_halves
 from avtorch.inference.coordinates import Coordinates
 from avtorch.inference.density import Density, has_selection, score_of, selected
 from avtorch.inference.exponential_form import matvec
 from avtorch.inference.importance import RELIABLE, pareto_k
 from avtorch.inference.map import find_mode
-from avtorch.inference.posterior import rhat_of_halves
 
 MEAN_TOLERANCE, SD_TOLERANCE, TAIL_TOLERANCE = 0.1, 0.05, 0.003
 """Tolerances: error of a mean in SDs, of an SD as a ratio, of the share of draws beyond TAIL as a probability."""

@@ -11,10 +11,10 @@ from torch import Tensor
 from avtorch.arrays import Bool
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief, Summary
+from avtorch.inference.chains import quantiles_of
 from avtorch.inference.density import Density
 from avtorch.inference.estimator import Estimator
 from avtorch.inference.form import Rows, WindowLikelihood
-from avtorch.inference.posterior import quantiles_of
 from avtorch.inference.priors import (
     Joint,
     LogSpaceNormal,
