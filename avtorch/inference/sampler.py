@@ -12,7 +12,7 @@ from avtorch.inference.compiled import compiled_form, compiled_walk
 from avtorch.inference.coordinates import Coordinates, stiffness
 from avtorch.inference.density import Density, SubsampledDensity, constrained, has_selection, score_of, selected
 from avtorch.inference.device import check_generator
-from avtorch.inference.exactness import Exactness, Moments, compare_with_exact
+from avtorch.inference.exactness import CACHED, Exactness, Moments, compare_with_exact
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.posterior import Posterior
 from avtorch.inference.sampler_settings import SamplerSettings
@@ -182,8 +182,10 @@ def _batches(density: Density, index: Tensor, slowdown: Tensor, chains: int) -> 
 def _furthest(w: Float[Tensor, "draw chain window d"]) -> Float[Tensor, "window d"]:
     """The draw of each window that is furthest from ``w = 0``, one that is no number if there is any."""
     planes = w.permute(2, 3, 0, 1).flatten(2)
-    # window by window, in the processor's cache; a NaN is the largest
-    return torch.stack([x[:, x.square().sum(0).argmax()] for x in planes])
+    size = len(planes) if w.is_cuda else max(1, CACHED // planes[0].numel())
+    # a NaN is the largest
+    at = torch.cat([part.square().sum(1).argmax(-1) for part in planes.split(size)])
+    return planes[torch.arange(len(planes), device=w.device), :, at]
 
 
 def _diverged(
