@@ -24,8 +24,8 @@ import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.inference import PopulationMargin, sample
+from avtorch.inference.chains import effective_sample_size
 from avtorch.inference.population import MEAN_SD, SPREAD
-from avtorch.inference.posterior import effective_sample_size
 
 F64 = torch.float64
 BETWEEN = 0.05  # of the truth

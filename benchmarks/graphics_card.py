@@ -65,7 +65,7 @@ def timed(call: Callable[[], Any], most: int = 5, enough_s: float = 12.0) -> tup
 
 def ess(draws: Any) -> float:
     """Effective draws of the worst parameter, the median over the first windows of ``(chain, draw, window, 3)``."""
-    from avtorch.inference.posterior import effective_sample_size, normal_scores
+    from avtorch.inference.chains import effective_sample_size, normal_scores
 
     return float(effective_sample_size(normal_scores(draws[:, :, :COUNTED])).median(0).values.min())
 

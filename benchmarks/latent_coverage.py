@@ -21,10 +21,10 @@ from torch import Tensor
 
 from avtorch.inference.density import Density
 from avtorch.inference.estimators import ImportanceSampling
+from avtorch.inference.estimators.other_posteriors import FIRST, _Solved
 from avtorch.inference.importance import weighted_draws
 from avtorch.inference.latent import LatentDensity, default_noise_prior
 from avtorch.inference.map import Mode
-from avtorch.inference.sequential import FIRST, _Solved
 from tests.inference.latent_windows import drawn_window
 
 KINDS = {

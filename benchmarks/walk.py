@@ -21,7 +21,7 @@ from benchmarks.peers.torch_rows import density_of
 
 #: Windows and chains: one log's, the peers' table, a fleet's.
 SIZES = ((1, 320), (1, 1024), (300, 320), (1000, 128))
-WAYS = ("eager", "compiled")
+WAYS = ("eager", "auto")
 
 
 def seconds(call: Callable[[], object]) -> float:
@@ -55,7 +55,7 @@ def measure(windows: int, chains: int, count: int) -> None:
         ("update", updates, 1e3 / windows, "ms a window"),
     ):
         times = pairs(calls, count, repeats=20 if windows == 1 else 1)
-        ratio = statistics.median(a / b for a, b in zip(times["eager"], times["compiled"], strict=True))
+        ratio = statistics.median(a / b for a, b in zip(times["eager"], times["auto"], strict=True))
         each = ", ".join(f"{way} {share * statistics.median(times[way]):.3g}" for way in WAYS)
         print(f"{windows} windows, {chains} chains, {name}: {each} {unit}; {ratio:.2f} x", flush=True)
 

@@ -140,7 +140,7 @@ def _density(log: Log, command: Command, stretches: list[slice], tried: list[flo
     """
     known = command(GRID_S[-1])[1]
     each = [_window(log, piece, command(x)[0], known) for piece in stretches for x in tried]
-    return LatentDensity(LatentWindow.stack(each)).approximation()
+    return LatentDensity(LatentWindow.stack(each))
 
 
 def _window(log: Log, piece: slice, u: FloatArray, known: BoolArray) -> LatentWindow:

@@ -7,7 +7,7 @@ rate. From it the strategist predicts clipping and cost before it acts on the ca
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -20,7 +20,7 @@ from avtorch.vehicle.block import Block
 from avtorch.vehicle.controllers import RAMP_RATE
 from avtorch.vehicle.leader import Leader
 from avtorch.vehicle.loop import ClosedLoop
-from avtorch.vehicle.performance import performance
+from avtorch.vehicle.performance import Performance, performance
 from avtorch.vehicle.plant import GLVDPlant
 
 _ROWS = 4096  # closed loops simulated in one batch: larger batches only cost memory
@@ -78,28 +78,6 @@ class History:
         return Leader(time, position, v, self.lead_accel, self.dt, "leader seen")
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """Predicted over the replay, every tensor of one shape, (scenario, candidate) from `replay`.
-
-    `clipped_share` of commands [-]; `throughput_vph` at equilibrium at the leader's mean speed with the setting's own
-    time gap; `jerk_rms_mps3` [m/s³] (comfort); `min_spacing_m`, `mean_spacing_m` [m]; `command_rms_mps2` [m/s²] and
-    `amplification` [-] (command effort).
-    """
-
-    clipped_share: Tensor
-    throughput_vph: Tensor
-    jerk_rms_mps3: Tensor
-    min_spacing_m: Tensor
-    mean_spacing_m: Tensor
-    command_rms_mps2: Tensor
-    amplification: Tensor
-
-    def map(self, change: Callable[[Tensor], Tensor]) -> Prediction:
-        """Apply a function of a tensor to every field."""
-        return Prediction(**{name: change(value) for name, value in vars(self).items()})
-
-
 @torch.no_grad()
 def replay(
     history: History,
@@ -115,8 +93,9 @@ def replay(
     delay: float = 0.0,
     link_delay: float = 0.0,
     dt: float = 0.05,
-) -> Prediction:
-    """Run `setting` (scenario, candidate) through `history` with the vehicle T_L [s], K_L [-] (scenario,).
+) -> Performance:
+    """Performance (scenario, candidate) of `setting` (scenario, candidate) through `history`, with the vehicle T_L [s],
+    K_L [-] (scenario,).
 
     The time gap leaves `time_gap_now` (scenario,) after `delay` [s] at `ramp_rate` [s/s]; the leader's acceleration is
     received `link_delay` [s] late. Limits [m/s²] are numbers or (scenario,). The step is the logged one or a multiple
@@ -124,7 +103,7 @@ def replay(
     oscillate, unlike the real loop.
     """
     strides = (torch.clamp_max(T_L / 6.0, dt) / history.dt + 1e-9).long().clamp(1, history.lead_speed.shape[1] - 1)
-    out: Prediction | None = None
+    out: Performance | None = None
     # The step follows from the scenario's own lag, so its prediction does not depend on the rest of the batch.
     for stride in strides.unique().tolist():
         rows = torch.nonzero(strides == stride)[:, 0]
@@ -160,7 +139,7 @@ def _replay_at(
     ramp_rate: float,
     delay: float,
     link_delay: float,
-) -> Prediction:
+) -> Performance:
     """`replay` at the step of `past`."""
     scenarios, candidates = setting.shape
     loop = ClosedLoop(
@@ -179,30 +158,11 @@ def _replay_at(
         start = Setting(time_gap=time_gap_now, gains=some.gains).controller(standstill=standstill)
         twin.controller = some.retarget(start, at=delay, rate=ramp_rate)
         twin.lower_level = some.lower_level(accel_min=limits[0], accel_max=limits[1])
-        parts.append(_predict(twin.advance(past.lead_speed.shape[1]), some, standstill))
-    return Prediction(*(torch.cat(column).mT for column in zip(*(vars(p).values() for p in parts), strict=True)))
+        run = twin.advance(past.lead_speed.shape[1])
+        parts.append(performance(run, time_gap=some.time_gap, standstill=standstill))
+    return Performance(*(torch.cat(column).mT for column in zip(*(vars(p).values() for p in parts), strict=True)))
 
 
 def of_scenarios(limit: Number, rows: Tensor) -> Number:
     """The limits of some of the scenarios, from one for all or one each."""
     return limit[rows] if isinstance(limit, Tensor) and limit.ndim else limit
-
-
-def _predict(run: Block, setting: Setting, standstill: float) -> Prediction:
-    """The prediction from one run (candidate, scenario, time) under `setting` (candidate, scenario)."""
-    shape = setting.shape
-
-    def flat(x: Tensor) -> Tensor:
-        return x.reshape(-1, x.shape[-1])
-
-    rows = Block(run.time, *(flat(v) for name, v in vars(run).items() if name != "time"))
-    seen = performance(rows, time_gap=setting.time_gap.reshape(-1), standstill=standstill)
-    return Prediction(
-        clipped_share=seen.clipped_share.reshape(shape),
-        throughput_vph=seen.throughput_vph.reshape(shape),
-        jerk_rms_mps3=seen.jerk_rms_mps3.reshape(shape),
-        min_spacing_m=seen.min_spacing_m.reshape(shape),
-        mean_spacing_m=run.spacing.mean(dim=-1),
-        command_rms_mps2=run.accel_cmd.square().mean(dim=-1).sqrt(),
-        amplification=setting.amplification(),
-    )

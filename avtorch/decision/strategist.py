@@ -27,11 +27,12 @@ import torch
 from torch import Tensor
 
 from avtorch.decision.grid import MARGIN, Candidates, Grid
-from avtorch.decision.replay import History, Prediction, replay
+from avtorch.decision.replay import History, replay
 from avtorch.decision.settings import Setting
 from avtorch.errors import InputError
 from avtorch.vehicle.arguments import Number
 from avtorch.vehicle.controllers import RAMP_RATE
+from avtorch.vehicle.performance import Performance
 
 _REPLAYED = 512  # at first; with few scenarios a larger batch costs hardly more
 _PAIRS = 1024
@@ -46,7 +47,7 @@ class Decision:
     """The decision for each scenario; every tensor (scenario,).
 
     `setting`: the choice. `sufficient`: whether it meets both conditions; `p_string_stable` under the belief.
-    `intrusiveness` as in `grid.py`. `predicted`: clipping and costs in the replay. `strategies` lead from the default
+    `intrusiveness` as in `grid.py`. `predicted`: the performance in the replay. `strategies` lead from the default
     to the choice; `changes`: it differs from the setting in force. `driver_delay_s`: the time that the driver is
     allowed to set a longer time gap, 0 where none is asked. `why`: one sentence each.
     """
@@ -55,7 +56,7 @@ class Decision:
     sufficient: Tensor
     p_string_stable: Tensor
     intrusiveness: Tensor
-    predicted: Prediction
+    predicted: Performance
     strategies: list[set[int]]
     changes: Tensor
     driver_delay_s: Tensor
@@ -217,7 +218,7 @@ class _Search:
         shape = candidates.cost.shape
         self.p = torch.full(shape, torch.nan, dtype=torch.float64)
         self.total = candidates.cost.clone()
-        self.predictions: Prediction | None = None
+        self.predictions: Performance | None = None
         self.replayed = torch.zeros(shape, dtype=torch.bool)
 
     def run(self) -> tuple[Tensor, Tensor]:
@@ -271,7 +272,7 @@ class _Search:
         )
         return gain.nan_to_num(torch.inf).clamp(1.0, _HIGHEST_GAIN).log()
 
-    def prediction(self, pick: Tensor) -> Prediction:
+    def prediction(self, pick: Tensor) -> Performance:
         assert self.predictions is not None
         return self.predictions.map(lambda x: x[torch.arange(len(pick)), pick])
 

@@ -84,7 +84,7 @@ class FleetSettings:
         read_mapping("", map=self.map or None, unit=self.unit or None, stamp=self.stamp or None)
         # the rest needs torch, which a call with nothing to compute does not
         if self.estimator != "auto":
-            from avtorch.inference.estimators.choose import ESTIMATORS
+            from avtorch.inference.estimators import ESTIMATORS
 
             if self.estimator not in ESTIMATORS:
                 raise InputError(f"estimator: found {quoted(self.estimator)}, needs auto, {', '.join(ESTIMATORS)}")

@@ -11,6 +11,7 @@ Example:
 """
 
 from avtorch.inference.belief import Belief
+from avtorch.inference.chains import nested_rhat
 from avtorch.inference.density import (
     ConstrainedDensity,
     Density,
@@ -22,7 +23,7 @@ from avtorch.inference.form import ExcitationRule, Form, JerkForm, WindowLikelih
 from avtorch.inference.jerk import JerkDensity, JerkPoints, JerkStatistics, jerk_log_likelihood
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.population import PopulationMargin
-from avtorch.inference.posterior import Posterior, nested_rhat
+from avtorch.inference.posterior import Posterior
 from avtorch.inference.quadrature import Quadrature, integrate
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings

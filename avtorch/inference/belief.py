@@ -12,8 +12,8 @@ from avtorch.arrays import Bool, Float, Int
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.inference.arviz_export import UNITS, inference_data, parameter_table
+from avtorch.inference.chains import quantiles_of
 from avtorch.inference.device import Device
-from avtorch.inference.posterior import quantile_of
 from avtorch.inference.priors import Prior
 from avtorch.inference.state import shaped_as
 
@@ -166,6 +166,6 @@ class Belief(Displayed):
     def of_prior(cls, names: tuple[str, ...], prior: Prior, kept: int, vehicles: int, g: torch.Generator) -> Belief:
         """The belief before any window: ``kept`` draws of the prior, from the generator ``g``."""
         draws = prior.sample(kept, vehicles, generator=g).exp()
-        quantiles = (quantile_of(draws, 0.05), quantile_of(draws, 0.95))
+        q05, q95 = quantiles_of(draws, 0.05, 0.95)
         never = torch.zeros(vehicles, dtype=torch.bool, device=draws.device)
-        return cls(names, draws.mean(0), draws.std(0), *quantiles, draws, excited=never, converged=~never)
+        return cls(names, draws.mean(0), draws.std(0), q05, q95, draws, excited=never, converged=~never)

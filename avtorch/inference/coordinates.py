@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Float
-from avtorch.inference.density import Density, has_score
+from avtorch.inference.density import Density, score_of
+from avtorch.inference.exponential_form import matvec
 from avtorch.inference.map import Mode
-from avtorch.inference.planes import lower_times, lower_transposed_times
 
 Whitening = Literal["full", "diagonal", "none"]
 
@@ -40,11 +40,11 @@ class Coordinates:
 
     def z(self, w: Float[Tensor, "*draw window d"]) -> Float[Tensor, "*draw window d"]:
         """``w`` ``(..., window, d)`` as log parameters (or whatever the density's unconstrained space is)."""
-        return lower_times(self.lower, w).add_(self.mode)
+        return matvec(self.lower, w) + self.mode
 
     def pull_back(self, score: Float[Tensor, "*draw window d"]) -> Float[Tensor, "*draw window d"]:
         """A gradient in ``z`` as one in ``w``."""
-        return lower_transposed_times(self.lower, score)
+        return matvec(self.lower.mT, score)
 
     def widest(self, mode: Mode) -> Float[Tensor, " window"]:
         """Largest SD that the Laplace approximation has along any direction of ``w``, ``(window,)``; 1 if whitened."""
@@ -68,14 +68,3 @@ def stiffness(density: Density, coordinates: Coordinates, *, radius: float = 3.0
     gradient = -coordinates.pull_back(score_of(density, coordinates.z(probes)))
     slope = (gradient * probes).sum(-1) / radius**2
     return slope.nan_to_num(nan=1e6, posinf=1e6).amax(0).clamp(1.0, 1e6)
-
-
-def score_of(density: Density, z: Float[Tensor, "*draw window d"]) -> Float[Tensor, "*draw window d"]:
-    """Gradient of the log density, in closed form where there is one; shape of ``z``."""
-    if has_score(density):
-        with torch.no_grad():
-            return density.score(z)
-    z = z.detach().requires_grad_()
-    with torch.enable_grad():
-        (score,) = torch.autograd.grad(density.log_prob(z).sum(), z)
-    return score

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol, TypeGuard, runtime_checkable
 
+import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
@@ -108,3 +109,14 @@ def has_quick_values(density: Density) -> bool:
 def constrained(density: Density, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
     """Parameters of ``density`` in their own units: ``exp(z)`` unless it defines another transform."""
     return density.constrain(z) if isinstance(density, ConstrainedDensity) else z.exp()
+
+
+def score_of(density: Density, z: Float[Tensor, "*draw window d"]) -> Float[Tensor, "*draw window d"]:
+    """Gradient of the log density, in closed form where there is one; shape of ``z``."""
+    if has_score(density):
+        with torch.no_grad():
+            return density.score(z)
+    z = z.detach().requires_grad_()
+    with torch.enable_grad():
+        (score,) = torch.autograd.grad(density.log_prob(z).sum(), z)
+    return score

@@ -8,11 +8,11 @@ from typing import Any
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference.belief import Belief
+from avtorch.inference.belief import Belief, Summary
 from avtorch.inference.device import Device, checked_device, generator_on
-from avtorch.inference.form import Rows, WindowLikelihood
-from avtorch.inference.priors import Joint, Prior, default_actuation_prior, prior_on
-from avtorch.inference.state import about, shaped_as
+from avtorch.inference.form import Form, Rows, WindowLikelihood
+from avtorch.inference.priors import Joint, Prior, default_actuation_prior
+from avtorch.inference.state import shaped_as
 
 
 class Estimator(ABC):
@@ -45,7 +45,7 @@ class Estimator(ABC):
             raise InputError(f"kept, vehicles: found {kept}, {vehicles}, need 2 or more draws and 1 or more vehicles")
         self.kept, self.vehicles, self.device = kept, vehicles, checked_device(device)
         actuation = default_actuation_prior() if actuation_prior is None else actuation_prior
-        self.first_prior = Joint(prior_on(actuation, self.device), prior_on(noise_prior, self.device))
+        self.first_prior = Joint(actuation, noise_prior).to(self.device)
         self.generator = generator_on(self.device, seed)
         self.belief = Belief.of_prior(names, self.first_prior, kept, vehicles, self.generator)
         self._memory: dict[str, Tensor] = {}  # one entry a vehicle
@@ -70,10 +70,37 @@ class Estimator(ABC):
         shapes or types than this one saves; nothing is then changed.
         """
         own = self.state_dict()
-        if about(state, "mode") != about(own, "mode"):
-            found, needed = about(state, "mode"), about(own, "mode")
-            raise InputError(f"state: (mode, names, vehicles) were {found} when it was saved, here they are {needed}")
+        for key in ("mode", "names"):
+            if isinstance(state, dict) and state.get(key) != own.get(key):
+                found = f"{str(state.get(key))[:80]} when it was saved, here it is {own.get(key)}"
+                raise InputError(f"state: {key} was {found}")
         shaped_as(own, state, "state")
         self.belief = self.belief.taken_from(state)
         self._memory = {name: value.clone().to(self.device) for name, value in state["memory"].items()}
         self.generator.set_state(state["generator"])
+
+
+class WindowedEstimator(Estimator):
+    """An estimator that works on the rows of the excited windows.
+
+    `form`: what is measured; the belief has its parameters. Takes the other arguments of :class:`Estimator`.
+    """
+
+    def __init__(self, form: Form, **options: Any) -> None:
+        super().__init__(form.names, form.noise_prior, **options)
+        self.form = form
+
+    def take(self, rows: Rows, likelihood: WindowLikelihood) -> Belief:
+        """Take in one window of every vehicle; those that are not excited keep their belief."""
+        index = likelihood.excited.nonzero().squeeze(-1)
+        if len(index):
+            excited = {name: rows[name][index] for name in ("usable", *self.form.columns)}
+            found, converged = self._learn({"time": rows["time"], **excited}, index)
+            self.belief = self.belief.updated(likelihood.excited, index, found, converged)
+        else:
+            self.belief = self.belief.unused(likelihood.excited)
+        return self.belief
+
+    @abstractmethod
+    def _learn(self, rows: Rows, index: Tensor) -> tuple[Summary, Tensor]:
+        """The summary of the vehicles ``index`` from their rows, and where it may be used, ``(vehicle,)`` bool."""

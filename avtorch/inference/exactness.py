@@ -14,20 +14,20 @@ A mode that no chain has reached is searched for by ascents of the density that 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from functools import lru_cache
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
-from avtorch.inference.compiled import Compiled, Unavailable, compiled
-from avtorch.inference.coordinates import Coordinates, score_of
-from avtorch.inference.density import Density, has_selection, selected
+from avtorch.inference.chains import rhat_of_halves
+from avtorch.inference.coordinates import Coordinates
+from avtorch.inference.density import Density, has_selection, score_of, selected
+from avtorch.inference.exponential_form import matvec
 from avtorch.inference.importance import RELIABLE, pareto_k
 from avtorch.inference.map import find_mode
-from avtorch.inference.planes import from_planes, lower_times, lower_transposed_times, to_planes
 
 MEAN_TOLERANCE, SD_TOLERANCE, TAIL_TOLERANCE = 0.1, 0.05, 0.003
 """Tolerances: error of a mean in SDs, of an SD as a ratio, of the share of draws beyond TAIL as a probability."""
@@ -46,8 +46,10 @@ CERTAIN = 0.4
 SCALES, SHARES = (1.0, 1.5, 3.0, 6.0, 15.0), (0.45, 0.27, 0.14, 0.09, 0.05)
 #: Factor by which a second test increases the points where the first is inconclusive.
 AGAIN = 8
-#: Points times windows at once, here and on a graphics card.
-BLOCK, CARD_BLOCK = 2**18, 2**22
+#: Points times windows at once, here, where the processor's cache holds them, and on a graphics card.
+BLOCK, CARD_BLOCK = 2**15, 2**22
+#: Numbers whose moments are taken at once.
+CACHED = 2**17
 #: Distances of the starts in SDs of the draws, evenly spaced; these are half of them, the others are mirror images.
 RADII = (4.0, 16.0)
 STARTS, STEPS = 16, 3
@@ -90,40 +92,45 @@ class Exactness:
         fine = (self.mean_error <= resolution) & (self.sd_error <= resolution)
         return fine.all(-1) & (self.pareto_k < RELIABLE)
 
-    def beyond(self, errors: float = 1.0) -> Bool[Tensor, "3 window parameter"]:
+    @cached_property
+    def beyond(self) -> Bool[Tensor, "3 window parameter"]:
         """Where mean, SD or tail of the draws exceeds tolerance and chance, ``(3, window, parameter)`` bool.
 
-        ``errors``: standard errors of the density's side that are allowed in addition.
+        A standard error of the density's side is allowed in addition.
         """
         off = torch.stack([self.mean_shift.abs(), (self.sd_ratio - 1).abs(), self.tail_excess.abs()])
         own_sd = torch.minimum(self.draws_sd_error, HEAVY * self.draws_mean_error)
         own = torch.stack([self.draws_mean_error, own_sd, self.draws_tail_error])
         other = torch.stack([self.mean_error, self.sd_error, self.tail_error])
         tolerance = off.new_tensor([MEAN_TOLERANCE, SD_TOLERANCE, TAIL_TOLERANCE])[:, None, None]
-        return ~(off <= torch.maximum(tolerance, ERRORS * own) + errors * other)
+        return ~(off <= torch.maximum(tolerance, ERRORS * own) + other)
 
+    @cached_property
     def sure(self) -> Bool[Tensor, " window"]:
         """Where more points would hardly change the answer, ``(window,)`` bool."""
-        return self.known() & (self.pareto_k < CERTAIN) | self.hopeless()
+        return self.known() & (self.pareto_k < CERTAIN) | self.hopeless
 
+    @cached_property
     def hopeless(self) -> Bool[Tensor, " window"]:
         """Where the ratios do not even have a mean: the density is far from the draws, ``(window,)`` bool."""
         return self.pareto_k > 1.0
 
+    @cached_property
     def clear(self) -> Bool[Tensor, " window"]:
         """Where the first test already shows that the draws follow the density, ``(window,)`` bool."""
-        return self.known(2 * RESOLUTION) & (self.pareto_k < CERTAIN) & ~self.beyond().any(0).any(-1)
+        return self.known(2 * RESOLUTION) & (self.pareto_k < CERTAIN) & ~self.beyond.any(0).any(-1)
 
+    @cached_property
     def holds(self) -> Bool[Tensor, " window"]:
         """Where the draws are shown to follow the density, ``(window,)`` bool."""
-        return (self.clear() | self.known() & ~self.beyond().any(0).any(-1)) & (self.missed == 0)
+        return (self.clear | self.known() & ~self.beyond.any(0).any(-1)) & (self.missed == 0)
 
     def why(self, names: tuple[str, ...]) -> list[str]:
         """What is wrong with each window, ``""`` where the draws follow the density."""
-        reasons, holds = [], self.holds()
+        reasons, holds = [], self.holds
         if bool(holds.all()):
             return [""] * len(holds)
-        for w, (known, beyond) in enumerate(zip(self.known().tolist(), self.beyond().movedim(1, 0), strict=True)):
+        for w, (known, beyond) in enumerate(zip(self.known().tolist(), self.beyond.movedim(1, 0), strict=True)):
             if bool(holds[w]):
                 reasons.append("")
             elif float(self.missed[w]) > 0:
@@ -163,45 +170,34 @@ class Exactness:
         return cls(**{f.name: (each[:, 0] if f.name in window else each).clone() for f in fields(cls)})
 
 
-def compare_with_exact(
-    density: Density,
-    z: Float[Tensor, "chain draw window parameter"],
-    *,
-    eager: bool = False,
-    moments: Moments | None = None,
-) -> Exactness:
-    """Compare draws ``z`` ``(chain, draw, window, parameter)``, of these ``moments`` where they are known, with their
-    density; ``eager`` without compiled loops.
+def compare_with_exact(density: Density, moments: Moments, total: int) -> Exactness:
+    """Compare draws of these moments, ``total`` of each window, with their density.
 
     The first test takes few points compared with the draws; windows where it is inconclusive get about AGAIN times as
-    many, which is where a compiled density begins, and those still undecided get AGAIN times more. Windows that pass
-    are searched for other modes.
+    many, and those still undecided get AGAIN times more. Windows that pass are searched for other modes.
     """
-    total = z.shape[0] * z.shape[1]
     points = min(1024, max(256, total // 8))
     closer = min(AGAIN * points, max(4 * points, total))
     # few draws mean that the density is expensive
     counts = (closer, AGAIN * closer) if total >= 4096 else (closer,)
-    everyone = torch.arange(z.shape[2], device=z.device)
+    everyone = torch.arange(len(moments.mean), device=moments.mean.device)
 
     def chosen(where: Tensor) -> Tensor:
         if has_selection(density):
             return everyone[where]
         return everyone if bool(where.any()) else everyone[:0]
 
-    moments = Moments.of(z) if moments is None else moments
-    if not eager and isinstance(compiled(density), Compiled):  # compiled points cost less than another call
-        points, *counts = counts
-    found = weighed(density, moments, points, eager=eager)
+    found = weighed(density, moments, points)
     for count in counts:
         # more points do not help where the ratios' tail is clearly heavy
-        index = chosen(~(found.clear() if count == closer else found.clear() | found.sure()))
+        index = chosen(~(found.clear if count == closer else found.clear | found.sure))
         if len(index):
-            found = found.put(index, weighed(selected(density, index), moments.select(index), count, eager=eager))
-    index = chosen(found.holds())
+            found = found.put(index, weighed(selected(density, index), moments.select(index), count))
+    index = chosen(found.holds)
     if len(index):
         part = moments.select(index)
-        found.missed[index] = missed_mass(selected(density, index), part.mean, part.lower, eager=eager)
+        missed = missed_mass(selected(density, index), part.mean, part.lower)
+        found = replace(found, missed=found.missed.index_put((index,), missed))
     return found
 
 
@@ -209,13 +205,15 @@ class Moments(NamedTuple):
     """Moments of draws: ``lower`` ``(window, parameter, parameter)``, the rest ``(window, parameter)``.
 
     Attributes:
+        rhat: nested R-hat.
         mean: in the units of ``z``.
-        lower: triangular root of the covariance.
+        lower: triangular root of the covariance, NaN where it has none.
         share: of the draws beyond TAIL.
         mean_error, sd_error: standard errors [SD, as a ratio] by the means of independent pieces: chains, cut where
             there are fewer than sixteen.
     """
 
+    rhat: Float[Tensor, "window parameter"]
     mean: Float[Tensor, "window parameter"]
     lower: Float[Tensor, "window parameter parameter"]
     share: Float[Tensor, "window parameter"]
@@ -225,53 +223,48 @@ class Moments(NamedTuple):
     @classmethod
     def of(cls, z: Float[Tensor, "chain draw window parameter"]) -> Moments:
         """Compute them from draws ``(chain, draw, window, parameter)``."""
+        size = z.shape[2] if z.is_cuda else max(1, CACHED // z[:, :, 0].numel())
+        parts = [cls._of(part) for part in z.split(size, 2)]
+        return parts[0] if len(parts) == 1 else cls(*map(torch.cat, zip(*parts, strict=True)))
+
+    @classmethod
+    def _of(cls, z: Float[Tensor, "chain draw window parameter"]) -> Moments:
         chains, draws = z.shape[:2]
-        pieces = pieces_of(chains, draws)
-        planes = to_planes(z.transpose(0, 1))  # (parameter, window, draw, chain), contiguous as the walk leaves it
+        # (window, parameter, draw, chain), contiguous as the walk leaves it
+        planes = z.permute(2, 3, 1, 0)
         mean = planes.mean((-2, -1))
         centred = planes - mean[..., None, None]
-        flat = centred.flatten(2).movedim(0, 1)  # (window, parameter, draw x chain)
+        square, flat = centred.square(), centred.flatten(2)
         covariance = flat @ flat.mT / (flat.shape[-1] - 1)
-        variance = covariance.diagonal(dim1=-2, dim2=-1).mT  # (parameter, window)
-        square = centred.square()
-        share = (square > TAIL**2 * variance[..., None, None]).mean((-2, -1), dtype=z.dtype)
-        whole = draws // pieces * pieces
-        each, squares = (x[..., :whole, :].unflatten(2, (pieces, -1)).mean(3) for x in (centred, square))
-        root = (pieces * chains) ** 0.5
-        of_mean = each.flatten(2).std(-1) / variance.sqrt() / root
-        of_sd = 0.5 * squares.flatten(2).std(-1) / variance / root
-        return cls(mean.mT, root_of(covariance), share.mT, of_mean.mT, of_sd.mT)
+        variance = covariance.diagonal(dim1=-2, dim2=-1)
+        beyond = (square > TAIL**2 * variance[..., None, None]).flatten(2).count_nonzero(-1)
+        pieces = 2 if chains >= 16 else 2 * max(1, min(draws // 4, -(-8 // chains)))
+        long = draws // pieces
+        of_piece = torch.eye(pieces, dtype=z.dtype, device=z.device).repeat_interleave(long, 1)
+        sums, squares = (of_piece @ x[..., : pieces * long, :] for x in (centred, square))
+        halves = (x.unflatten(2, (2, -1)).sum(3) for x in (sums, squares))
+        rhat = rhat_of_halves(*halves, half=long * pieces // 2)
+        # many chains are pieces enough; halves of one are not independent
+        count, long = (chains, 2 * long) if chains >= 16 else (pieces * chains, long)
+        each, each_square = ((x.sum(2) if chains >= 16 else x.flatten(2)).std(-1) / long for x in (sums, squares))
+        of_mean, of_sd = each / (variance * count).sqrt(), 0.5 * each_square / variance / count**0.5
+        lower, failed = torch.linalg.cholesky_ex(covariance.nan_to_num())
+        lower = torch.where((failed == 0)[:, None, None], lower, torch.nan)
+        return cls(rhat, mean, lower, beyond.to(z) / flat.shape[-1], of_mean, of_sd)
 
     def select(self, index: Int[Tensor, " chosen"]) -> Moments:
         """The windows named by ``index``."""
         return self if len(index) == len(self.mean) else Moments(*(x[index] for x in self))
 
 
-def pieces_of(chains: int, draws: int) -> int:
-    """Into how many pieces each chain is cut, so that there are sixteen."""
-    return max(1, min(draws // 2, -(-16 // chains)))
-
-
-def root_of(covariance: Float[Tensor, "window d d"]) -> Float[Tensor, "window d d"]:
-    """Its triangular root, NaN where it has none."""
-    lower, failed = torch.linalg.cholesky_ex(covariance.nan_to_num())
-    return torch.where((failed == 0)[:, None, None], lower, torch.nan)
-
-
-def weighed(density: Density, moments: Moments, points: int, *, eager: bool = False) -> Exactness:
+def weighed(density: Density, moments: Moments, points: int) -> Exactness:
     """Compare draws of these moments with their density: one call of its ``log_prob``, or a few for many windows."""
-    mean, lower, share, mean_error, sd_error = moments
+    _, mean, lower, share, mean_error, sd_error = moments
     base, log_proposal = (x.to(mean.device) for x in proposal(points, mean.shape[-1]))
-    found = []
     size = max(1, (CARD_BLOCK if mean.is_cuda else BLOCK) // points) if has_selection(density) else len(mean)
-    for part in torch.arange(len(mean), device=mean.device).split(size):
-        chosen = selected(density, part)
-        loops = Unavailable("not asked for") if eager else compiled(chosen)
-        if isinstance(loops, Unavailable):
-            found.append(_weighed(chosen, mean[part], lower[part], base, log_proposal))
-        else:
-            found.append(loops.weighed(mean[part], lower[part], base, log_proposal, TAIL))
-    k, m, variance, tail, m_error, v_error, tail_error = (torch.cat(x) for x in zip(*found, strict=True))
+    parts = torch.arange(len(mean), device=mean.device).split(size)
+    found = [_weighed(selected(density, i), mean[i], lower[i], base, log_proposal) for i in parts]
+    k, m, variance, tail, m_error, v_error, tail_error = map(torch.cat, zip(*found, strict=True))
     spread = variance.sqrt()
     # binomial error of the tail's share, for the mean's effective number of independent draws
     of_tail = (torch.maximum(share, tail) * mean_error.square()).sqrt()
@@ -283,22 +276,22 @@ def weighed(density: Density, moments: Moments, points: int, *, eager: bool = Fa
 
 def _weighed(density: Density, mean: Tensor, lower: Tensor, base: Tensor, log_proposal: Tensor) -> tuple[Tensor, ...]:
     """Pareto-k; weighted mean, variance and tail's share with their errors, in the draws' SDs about their mean."""
-    away = lower_times(lower, base[:, None].expand(-1, len(mean), -1))
+    away = matvec(lower, base[:, None].expand(-1, len(mean), -1))
     with torch.no_grad():
         log_ratio = log_density(density, away + mean) - log_proposal[:, None]
     log_ratio = log_ratio.masked_fill(~(log_ratio < torch.inf), -torch.inf)
-    weight = log_ratio.softmax(0).nan_to_num()[..., None]
-    y = away / lower.square().sum(-1).sqrt()
+    weight = log_ratio.mT.softmax(-1).nan_to_num()[:, None]
+    # (window, parameter, point), as they are in memory
+    y = away.permute(1, 2, 0) / lower.square().sum(-1, keepdim=True).sqrt()
     out = (y.abs() > TAIL).to(y)
-    m, tail = (weight * torch.stack([y, out])).sum(1).unbind(0)
+    m, tail = y @ weight.mT, out @ weight.mT
     off = y - m
     square = off.square()
-    variance = (weight * square).sum(0).clamp_min(1e-300)
-    terms = weight * torch.stack([off, square - variance, out - tail])
+    variance = (square @ weight.mT).clamp_min(1e-300)
     # point and mirror image count as one: their errors cancel in part
-    half = len(y) // 2
-    errors = (terms[:, :half] + terms[:, half:]).square_().sum(1).sqrt_()
-    return pareto_k(log_ratio), m, variance, tail, *errors.unbind(0)
+    pairs = ((weight * x).unflatten(-1, (2, -1)).sum(-2) for x in (off, square - variance, out - tail))
+    errors = (x.square().sum(-1).sqrt() for x in pairs)
+    return pareto_k(log_ratio), *(x.squeeze(-1) for x in (m, variance, tail)), *errors
 
 
 def log_density(density: Density, z: Float[Tensor, "point window parameter"]) -> Float[Tensor, "point window"]:
@@ -333,27 +326,19 @@ def proposal(points: int, d: int) -> tuple[Float[Tensor, "point d"], Float[Tenso
     share = torch.tensor(SHARES, dtype=torch.float64).log()
     parts = share - 0.5 * square / scales.square() - d * scales.log() - 0.5 * d * math.log(2 * math.pi)
     # the memory order in which the sums over points run
-    return from_planes(x.mT.contiguous()[:, None]).squeeze(1), parts.logsumexp(-1)
+    return x.mT.contiguous().mT, parts.logsumexp(-1)
 
 
 def missed_mass(
-    density: Density,
-    mean: Float[Tensor, "window parameter"],
-    lower: Float[Tensor, "window parameter parameter"],
-    *,
-    eager: bool = False,
+    density: Density, mean: Float[Tensor, "window parameter"], lower: Float[Tensor, "window parameter parameter"]
 ) -> Float[Tensor, " window"]:
     """Mass of the heaviest mode found far from the draws, over that at the draws, ``(window,)``; 0 where none was.
 
-    `mean`, `lower`: the draws' mean ``(window, parameter)`` and triangular root of their covariance. `eager`: without
-    compiled loops.
+    `mean`, `lower`: the draws' mean ``(window, parameter)`` and triangular root of their covariance.
     """
-    missed, loops = mean.new_zeros(len(mean)), Unavailable("not asked for") if eager else compiled(density)
+    missed = mean.new_zeros(len(mean))
     try:
-        if isinstance(loops, Unavailable):
-            w, height = _climbed(density, mean, lower)
-        else:
-            w, height = loops.climbed(Coordinates(mean, lower), starts(mean.shape[-1]), STEPS, STRIDE)
+        w, height = _climbed(density, mean, lower)
     except ValueError:  # a user's function that raises this far out: no search ends there
         return missed
     high = (w.square().sum(-1) > FAR**2) & (height > -DEPTH)
@@ -362,7 +347,7 @@ def missed_mass(
         return missed
     best = height.masked_fill(~high, -torch.inf).argmax(0)[index]
     chosen = selected(density, index)
-    other = find_mode(chosen, start=lower_times(lower[index], w[best, index]) + mean[index])
+    other = find_mode(chosen, start=matvec(lower[index], w[best, index]) + mean[index])
     with torch.no_grad():
         centre = chosen.log_prob(mean[index])
     away = torch.linalg.solve_triangular(lower[index], (other.z - mean[index])[..., None], upper=False)[..., 0]
@@ -376,13 +361,14 @@ def missed_mass(
 def _climbed(density: Density, mean: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
     """Where ascents from all starts end, in the draws' SDs about their mean, and the log density there less that at the
     mean."""
+    at = Coordinates(mean, lower)
     w = starts(mean.shape[-1]).to(mean.device)[:, None].expand(-1, len(mean), -1)
     for _ in range(STEPS):
-        slope = lower_transposed_times(lower, score_of(density, lower_times(lower, w) + mean))
+        slope = at.pull_back(score_of(density, at.z(w)))
         w = w + slope * (STRIDE / slope.square().sum(-1, keepdim=True).sqrt_()).clamp_max_(1.0)
     w = w.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
     with torch.no_grad():
-        height = density.log_prob(torch.cat([mean[None], lower_times(lower, w) + mean]))
+        height = density.log_prob(torch.cat([mean[None], at.z(w)]))
     return w, height[1:] - height[:1]
 
 

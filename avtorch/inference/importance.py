@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Bool, Float, Int
+from avtorch.arrays import Bool, Float, FloatArray
 from avtorch.errors import InputError
 from avtorch.inference.density import Density
 from avtorch.inference.device import check_generator
@@ -34,11 +35,6 @@ def reliable(draws: int) -> float:
     return min(1 - 1 / math.log10(draws), RELIABLE) if draws > 10 else -math.inf
 
 
-def tail_of(n: int) -> int:
-    """How many of ``n`` ratios are their tail."""
-    return max(5, math.ceil(min(n / 5, 3 * n**0.5)))
-
-
 def pareto_k(log_ratio: Float[Tensor, "draw window"]) -> Float[Tensor, " window"]:
     """Shape ``k`` of the tail of ratios given by their logarithm ``(draw, window)``; returns ``(window,)``.
 
@@ -46,37 +42,33 @@ def pareto_k(log_ratio: Float[Tensor, "draw window"]) -> Float[Tensor, " window"
     in Pareto-smoothed importance sampling (Vehtari et al., JMLR 25(72), 2024). Infinite where a ratio is NaN or all
     are zero; minus infinity where the largest are all alike.
     """
-    tail = tail_of(len(log_ratio))
-    largest = log_ratio.masked_fill(log_ratio.isnan(), -torch.inf).topk(tail + 1, 0).values
-    broken = log_ratio.isnan().any(0) | ~largest[0].isfinite()
-    ratio = (largest - largest[0]).exp().nan_to_num(nan=0.0)
-    excess = (ratio[:-1] - ratio[-1]).flip(0)  # ascending
-    alike = excess[-1] < 1e-12
-    k = _shape(torch.where(alike, 1.0, excess))
-    return k.masked_fill(alike, -torch.inf).masked_fill(broken, torch.inf)
+    tail = max(5, math.ceil(min(len(log_ratio) / 5, 3 * len(log_ratio) ** 0.5)))
+    lost = log_ratio.isnan()
+    largest = log_ratio.masked_fill(lost, -torch.inf).topk(tail + 1, 0).values.double().cpu().numpy()
+    with np.errstate(all="ignore"):  # where all are zero, or alike
+        ratio = np.nan_to_num(np.exp(largest - largest[0]), nan=0.0)
+        excess = (ratio[:-1] - ratio[-1])[::-1]  # ascending
+        alike = excess[-1] < 1e-12
+        k = np.where(alike, -np.inf, _shape(np.where(alike, 1.0, excess)))
+    k[lost.any(0).cpu().numpy() | ~np.isfinite(largest[0])] = np.inf
+    return torch.from_numpy(k).to(log_ratio)
 
 
-def _shape(x: Tensor) -> Tensor:
+def _shape(x: FloatArray) -> FloatArray:
     """Shape of a generalised Pareto law (Zhang and Stephens, Technometrics 51, 2009); ``x`` ``(n, window)`` rises.
 
     The posterior mean over a grid of its other parameter, and a weak prior at 0.5 that weighs as much as ten ratios.
     """
     n = len(x)
     count = 30 + int(n**0.5)
-    steps = 1 - (count / (torch.arange(1, count + 1, dtype=x.dtype, device=x.device) - 0.5)).sqrt()
-    quarter = x[int(n / 4 + 0.5) - 1].clamp_min(1e-300)
+    steps = 1 - np.sqrt(count / (np.arange(1, count + 1) - 0.5))
+    quarter = np.maximum(x[int(n / 4 + 0.5) - 1], 1e-300)
     b = steps[:, None] / (3 * quarter) + 1 / x[-1]
-    k = torch.log1p(-b[:, None] * x).mean(1)
-    profile = n * ((-b / k).log() - k - 1)
-    b = (profile.nan_to_num(nan=-torch.inf).softmax(0) * b).sum(0)
-    return (n * torch.log1p(-b * x).mean(0) + 5) / (n + 10)
-
-
-@runtime_checkable
-class ApproximatedDensity(Density, Protocol):
-    """A density with a cheaper one near it, in which proposals are sought; the weights remain those of the exact."""
-
-    def approximation(self) -> Density: ...
+    k = np.log1p(-b[:, None] * x).mean(1)
+    profile = np.nan_to_num(n * (np.log(-b / k) - k - 1), nan=-np.inf)
+    weight = np.exp(profile - profile.max(0))
+    b = (weight * b).sum(0) / weight.sum(0)
+    return (n * np.log1p(-b * x).mean(0) + 5) / (n + 10)
 
 
 @dataclass(frozen=True)
@@ -151,21 +143,13 @@ class WeightedDraws:
 
     def equal(self, count: int, generator: torch.Generator) -> Float[Tensor, "count window parameter"]:
         """``count`` equally weighted draws of ``z``, by systematic resampling; a heavy draw comes more than once."""
-        # in random order, so that any leading stretch is a sample
-        return _picked(
-            self.z, self.systematic(count, generator)[torch.randperm(count, generator=generator, device=self.z.device)]
-        )
-
-    def systematic(self, count: int, generator: torch.Generator | None) -> Int[Tensor, "count window"]:
-        """Which draw each of ``count`` equally weighted ones is, by systematic resampling."""
         like: dict[str, Any] = {"dtype": self.z.dtype, "device": self.z.device}
         begin = torch.rand(self.z.shape[1], 1, generator=generator, **like)
         at = (torch.arange(count, **like) + begin) / count
-        return torch.searchsorted(self.weight.cumsum(0).mT.contiguous(), at).clamp_max(len(self.z) - 1).mT
-
-
-def _picked(z: Tensor, index: Tensor) -> Tensor:
-    return z.gather(0, index[..., None].expand(-1, -1, z.shape[-1]))
+        index = torch.searchsorted(self.weight.cumsum(0).mT.contiguous(), at).clamp_max(len(self.z) - 1).mT
+        # in random order, so that any leading stretch is a sample
+        index = index[torch.randperm(count, generator=generator, device=self.z.device)]
+        return self.z.gather(0, index[..., None].expand(-1, -1, self.z.shape[-1]))
 
 
 class _Mixture:
@@ -206,11 +190,6 @@ class _Mixture:
         return -0.5 * (nu + d) * torch.log1p(distance / nu) - log_det
 
 
-def approximated(density: Density) -> Density:
-    """The density near this one in which proposals are sought; itself where it has none."""
-    return density.approximation() if isinstance(density, ApproximatedDensity) else density
-
-
 @torch.no_grad()
 def weighted_draws(
     density: Density,
@@ -221,44 +200,9 @@ def weighted_draws(
 ) -> WeightedDraws:
     """Weighted draws from the posterior of every window, with proposals around ``mode``, sought where not given."""
     settings = ImportanceSettings() if settings is None else settings
-    nearby = approximated(density)
-    mode = find_mode(nearby, from_values=True, tolerance=5e-5) if mode is None else mode
+    mode = find_mode(density, from_values=True, tolerance=5e-5) if mode is None else mode
     check_generator(generator, mode.z.device)
-    mean, root = mode.z, mode.scale
-    if nearby is density:
-        return _adapted(density, settings, mean, root, generator)
-    near = _adapted(nearby, settings, mean, root, generator)
-    found = _corrected(density, nearby, near, settings, generator)
-    if bool(found.converged(settings).all()):
-        return found
-    return _adapted(density, settings, *_fitted(near.z, near.weight, root), generator)
-
-
-def _corrected(
-    density: Density,
-    nearby: Density,
-    near: WeightedDraws,
-    settings: ImportanceSettings,
-    generator: torch.Generator | None,
-) -> WeightedDraws:
-    """Draws from the density nearby, made equal in weight, with the weight that turns them into the exact one's.
-
-    A draw that came more than once weighs as often, but counts as one among the effective draws.
-    """
-    count = 2 * settings.draws
-    index = near.systematic(count, generator)
-    z = _picked(near.z, index)
-    log_ratio = density.log_prob(z) - nearby.log_prob(z)
-    log_ratio = torch.where(log_ratio.isfinite(), log_ratio, -torch.inf)
-    weight = log_ratio.softmax(0)
-    shared = torch.zeros_like(near.weight).scatter_add(0, index, weight)
-    return WeightedDraws(z, weight, torch.maximum(pareto_k(log_ratio), near.pareto_k), 1 / shared.square().sum(0))
-
-
-def _adapted(
-    density: Density, settings: ImportanceSettings, mean: Tensor, root: Tensor, generator: torch.Generator | None
-) -> WeightedDraws:
-    mixture = _Mixture(settings)
+    mean, root, mixture = mode.z, mode.scale, _Mixture(settings)
     z, target = mean.new_empty(0, *mean.shape), mean.new_empty(0, len(mean))
     for k in range(settings.rounds):
         if k:

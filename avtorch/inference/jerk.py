@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int, Real
 from avtorch.inference.device import Device
-from avtorch.inference.exponential_form import ExponentialForm, terms_of
-from avtorch.inference.planes import as_planes, from_planes, to_planes
-from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior, prior_on
+from avtorch.inference.exponential_form import ExponentialForm, PotentialTerms
+from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
 from avtorch.vehicle.glvd import glvd_jerk
 
 _LOG_2PI = math.log(2 * math.pi)
@@ -111,25 +111,21 @@ class JerkStatistics:
 class JerkDensity:
     """Posterior of ``(T_L [s], K_L [-], sigma [m/s^3])`` of every window, from the six sums and a prior.
 
-    It is the log density of :func:`jerk_log_likelihood` plus the prior, written in the sums.
+    It is the log density of :func:`jerk_log_likelihood` plus the prior, written in the sums. Eq. 1 is a regression of
+    jerk on ``(a, u)``: half the residual sum of squares is a quadratic form in ``(1, 1/T_L, K_L/T_L) / sigma``.
     """
 
     names = ("T_L", "K_L", "sigma")
 
     def __init__(self, statistics: JerkStatistics, prior: Prior | None = None) -> None:
-        self.statistics = statistics
+        self.statistics = s = statistics
         own = Joint(default_actuation_prior(), default_jerk_noise_prior()) if prior is None else prior
-        self.prior = prior_on(own, statistics.n.device)
-        s = statistics
-        # residual sum of squares as a quadratic form in (1, 1/T, K/T), divided by two once here
+        self.prior = own.to(s.n.device)
         rows = ((s.jj, s.aj, -s.uj), (s.aj, s.aa, -s.au), (-s.uj, -s.au, s.uu))
-        self._half_form = 0.5 * torch.stack([torch.stack(row, -1) for row in rows], -2)
-        # made when asked for: the prior that it was made with, and the form
-        self._form: tuple[Prior, ExponentialForm] | None = None
-        if len(s.n) == 1:
-            self._form_of_one = 2 * self._half_form[0]
-            self._points_of_one = -s.n * _LOG_SCALED.new_tensor([[0.0], [0.0], [1.0]]).to(s.n.device)
-            self._log_scaled = _LOG_SCALED.to(s.n.device)
+        coupling = torch.stack([torch.stack(row, -1) for row in rows], -2)
+        none = torch.zeros_like(s.n)
+        noise = PotentialTerms.of(len(s.n), 3, constant=0.5 * _LOG_2PI * s.n, linear=torch.stack([none, none, s.n], -1))
+        self._likelihood = ExponentialForm(noise, _LOG_SCALED.to(s.n.device), coupling)
 
     @property
     def windows(self) -> int:
@@ -139,60 +135,23 @@ class JerkDensity:
         """The windows named by ``index``."""
         return JerkDensity(self.statistics.select(index), self.prior.select(index))
 
+    @cached_property
+    def exponential_form(self) -> ExponentialForm:
+        """Minus :meth:`log_prob`."""
+        prior, noise = self.prior.terms(self.windows), self._likelihood.terms
+        terms = prior._replace(constant=prior.constant + noise.constant, linear=prior.linear + noise.linear)
+        return replace(self._likelihood, terms=terms)
+
     def log_likelihood(self, z: Float[Tensor, "*draw window 3"]) -> Float[Tensor, "*draw window"]:
         """Eq. 4 from the sums; ``z = log(T_L, K_L, sigma)``, ``(..., window, 3)``; returns ``(..., window)``."""
-        scaled = self._scaled_coefficients(z)
-        half_chi2 = (torch.einsum("wij,...wj->...wi", self._half_form, scaled) * scaled).sum(-1)
-        return -half_chi2 - self.statistics.n * (z[..., 2] + 0.5 * _LOG_2PI)
-
-    @staticmethod
-    def _scaled_coefficients(z: Tensor) -> Tensor:
-        """``(1, 1/T, K/T) / sigma``: Eq. 1 as the regression of jerk on ``(a, u)``, in units of its noise."""
-        log_T, log_K, log_sigma = z.unbind(-1)
-        return torch.stack([-log_sigma, -log_sigma - log_T, log_K - log_T - log_sigma], -1).exp()
+        return -self._likelihood.potential(z)
 
     def log_prob(self, z: Float[Tensor, "*draw window 3"]) -> Float[Tensor, "*draw window"]:
-        return self.log_likelihood(z) + self.prior.log_prob(z)
-
-    def exponential_form(self) -> ExponentialForm | None:
-        """Minus :meth:`log_prob` in the form that a compiled walk takes; ``None`` for a prior that is not of it."""
-        if self._form is not None and self._form[0] is self.prior:
-            return self._form[1]
-        prior = terms_of(self.prior, self.windows)
-        if prior is None:
-            return None
-        n = self.statistics.n
-        linear = torch.cat([prior.linear[:, :2], prior.linear[:, 2:] + n[:, None]], -1)
-        terms = replace(prior, constant=prior.constant + 0.5 * _LOG_2PI * n, linear=linear)
-        form = ExponentialForm(terms, _LOG_SCALED.to(n.device), n.new_zeros(3), 2 * self._half_form)
-        self._form = (self.prior, form)
-        return form
+        return -self.exponential_form.potential(z)
 
     def score(self, z: Float[Tensor, "*draw window 3"]) -> Float[Tensor, "*draw window 3"]:
-        """Gradient of :meth:`log_prob` in ``z``, in closed form, parameter by parameter (see :func:`as_planes`)."""
-        if self.windows == 1:
-            return self._score_of_one(z)
-        log_T, log_K, log_sigma = z.unbind(-1)
-        s = self.statistics
-        # (1, 1/T, K/T) / sigma, then half the chi2 differentiated by their logarithms
-        one = (-log_sigma).exp()
-        lag = (-log_sigma - log_T).exp()
-        gain = (log_K - log_T - log_sigma).exp()
-        by_one = one * (s.jj * one).addcmul_(s.aj, lag).addcmul_(s.uj, gain, value=-1)
-        by_lag = lag * (s.aj * one).addcmul_(s.aa, lag).addcmul_(s.au, gain, value=-1)
-        by_gain = gain * (s.uu * gain).addcmul_(s.au, lag, value=-1).addcmul_(s.uj, one, value=-1)
-        by_lag += by_gain
-        by_one += by_lag
-        by_one -= s.n
-        return as_planes(by_lag, -by_gain, by_one).add_(self.prior.score(z))
-
-    def _score_of_one(self, z: Tensor) -> Tensor:
-        """:meth:`score` of a single window in three products, where every call counts."""
-        planes = to_planes(z)
-        scaled = (self._log_scaled @ planes.reshape(3, -1)).exp_()
-        by_log = (self._form_of_one @ scaled).mul_(scaled)
-        score = torch.addmm(self._points_of_one, self._log_scaled.T, by_log, alpha=-1)
-        return from_planes(score.view(planes.shape)).add_(self.prior.score(z))
+        """Gradient of :meth:`log_prob` in ``z``, in closed form."""
+        return -self.exponential_form.slope(z)
 
     def initial(self) -> Float[Tensor, "window 3"]:
         """Least squares where it gives positive values near the plausible range, else the prior's centre."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -16,11 +15,11 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int, Real
 from avtorch.errors import InputError
-from avtorch.inference.compiled import Unavailable, load_kernels
+from avtorch.inference.compiled import load_kernels
 from avtorch.inference.device import Device
 from avtorch.inference.form import Rows, WindowLikelihood
 from avtorch.inference.latent_model import ACCEL_SD0, SPEED_SD0, latent_log_likelihood
-from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior, prior_on
+from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior
 from avtorch.inference.sampler_settings import SamplerSettings
 
 #: A step longer than this many median steps is a gap: the filter starts afresh behind it.
@@ -185,47 +184,38 @@ def run_log_likelihood(
 
     Where a gradient is asked for by the filter in torch, otherwise the same number by the compiled one.
     """
-    noise = {name: (p[name].square() + FINEST**2).sqrt() for name in ("accel_noise", "speed_noise") if name in p}
-    noise |= {name: p[name] for name in ("road_noise",) if name in p}
-    five = (p["T_L"], p["K_L"], p["process_noise"], p["coloured_sd"], p["coloured_time"])
-    if not (torch.is_grad_enabled() and any(x.requires_grad for x in (*five, *noise.values()))):
-        values = compiled_log_likelihood(*five, runs, steps, **noise)
-        if values is not None:
-            return values
+    sensors = ("accel_noise", "speed_noise")
+    p = {name: (x.square() + FINEST**2).sqrt() if name in sensors else x for name, x in p.items()}
+    graph = torch.is_grad_enabled() and any(x.requires_grad for x in p.values())
+    values = None if graph else compiled_log_likelihood(p, runs, steps)
+    if values is not None:
+        return values
     time = runs.time
     if steps is not None:
         time = steps[:, None] * torch.arange(time.shape[1], dtype=torch.float64, device=time.device)
-    return latent_log_likelihood(*five, time, runs.u, mask=runs.mask, accel=runs.accel, speed=runs.speed, **noise)
+    return latent_log_likelihood(**p, time=time, u=runs.u, mask=runs.mask, accel=runs.accel, speed=runs.speed)
 
 
 @torch.no_grad()
 def compiled_log_likelihood(
-    T_L: Float[Tensor, "*draw run"],
-    K_L: Float[Tensor, "*draw run"],
-    process_noise: Float[Tensor, "*draw run"],
-    coloured_sd: Float[Tensor, "*draw run"],
-    coloured_time: Float[Tensor, "*draw run"],
-    runs: LatentWindow,
-    steps: Float[Tensor, " run"] | None,
-    *,
-    accel_noise: Float[Tensor, "*draw run"] | None = None,
-    speed_noise: Float[Tensor, "*draw run"] | None = None,
-    road_noise: Float[Tensor, "*draw run"] | None = None,
+    p: dict[str, Float[Tensor, "*draw run"]], runs: LatentWindow, steps: Float[Tensor, " run"] | None
 ) -> Float[Tensor, "*draw run"] | None:
-    """Log likelihood ``(..., run)`` [nats] with no gradient, on the processor; NaN where digits are lost.
+    """As :func:`run_log_likelihood`, with no gradient, on the processor; NaN where digits are lost.
 
-    Arguments as of `latent_log_likelihood`; None where nothing can be compiled here.
+    None where nothing can be compiled here.
     """
     kernels = load_kernels("latent_kernels")
-    if isinstance(kernels, Unavailable):
+    if kernels is None:
         return None
-    zero, device = torch.zeros_like(T_L), T_L.device
-    six = (T_L, K_L, process_noise, zero if road_noise is None else road_noise, coloured_sd, coloured_time)
-    two = (zero if x is None else x.square() for x in (speed_noise, accel_noise))
-    given = torch.stack((*six, *two)).reshape(8, -1, T_L.shape[-1]).movedim(-1, 0).cpu().contiguous().numpy()
+    like = p["T_L"]
+    zero, device = torch.zeros_like(like), like.device
+    names = ("T_L", "K_L", "process_noise", "road_noise", "coloured_sd", "coloured_time")
+    variances = [p.get(name, zero).square() for name in ("speed_noise", "accel_noise")]
+    given = torch.stack([*(p.get(name, zero) for name in names), *variances])
+    given = given.reshape(8, -1, like.shape[-1]).movedim(-1, 0).cpu().contiguous().numpy()
     rows = runs if device.type == "cpu" else runs.to("cpu")
-    speed = None if speed_noise is None or rows.speed is None else (rows.speed - rows.speed[:, :1]).numpy()
-    accel = None if accel_noise is None or rows.accel is None else rows.accel.numpy()
+    speed = None if "speed_noise" not in p or rows.speed is None else (rows.speed - rows.speed[:, :1]).numpy()
+    accel = None if "accel_noise" not in p or rows.accel is None else rows.accel.numpy()
     time, u, none = rows.time.numpy(), rows.u.numpy(), np.empty(0)
     found = np.empty((len(u), given.shape[2]))
     for run, count in enumerate(rows.mask.sum(-1).tolist()):
@@ -233,12 +223,10 @@ def compiled_log_likelihood(
         signals = (none if x is None else x[run, :count] for x in (speed, accel))
         parameters = (given[run, :6], given[run, 6:], SPEED_SD0, ACCEL_SD0)
         kernels.filtered(found[run], *parameters, dt, steps is not None, u[run, :count], *signals)
-    return torch.from_numpy(found.T.copy()).reshape(T_L.shape).to(device)
+    return torch.from_numpy(found.T.copy()).reshape(like.shape).to(device)
 
 
-def even_steps(
-    runs: LatentWindow, *, most_steps: float = EVEN_STEPS, most_s: float = EVEN_S
-) -> Float[Tensor, " run"] | None:
+def even_steps(runs: LatentWindow) -> Float[Tensor, " run"] | None:
     """The step ``(run,)`` [s] of even rows, or None where a row is further off its run's grid than both bounds."""
     count = runs.mask.sum(-1)
     index = torch.arange(runs.time.shape[1], dtype=torch.float64, device=runs.time.device)
@@ -247,7 +235,7 @@ def even_steps(
     # A run of a single row has no step; any value will do.
     dt = torch.where(count > 1, dt, dt[count > 1].median() if bool((count > 1).any()) else 0.01)
     off = (runs.time - runs.time[:, :1] - dt[:, None] * index).abs() * runs.mask
-    return None if bool((off > (most_steps * dt[:, None]).clamp(max=most_s)).any()) else dt
+    return None if bool((off > (EVEN_STEPS * dt[:, None]).clamp(max=EVEN_S)).any()) else dt
 
 
 class LatentDensity:
@@ -263,7 +251,7 @@ class LatentDensity:
         self.data = data
         self.names = latent_names(accel=data.accel is not None, speed=data.speed is not None)
         own = Joint(default_actuation_prior(), default_noise_prior(self.names[2:])) if prior is None else prior
-        self.prior = prior_on(own, data.time.device)
+        self.prior = own.to(data.time.device)
         self._runs, self._owner = data.runs()
         self._steps = even_steps(self._runs)
 
@@ -282,16 +270,6 @@ class LatentDensity:
         if len(self._owner) == self.windows:
             return per_run
         return per_run.new_zeros(*per_run.shape[:-1], self.windows).index_add(-1, self._owner, per_run)
-
-    def approximation(self) -> LatentDensity:
-        """The same law with rows moved to an even grid where none of them moves by a step, for `weighted_draws`: this
-        density itself where its rows are even, or too uneven."""
-        steps = None if self._steps is not None else even_steps(self._runs, most_steps=1.0, most_s=torch.inf)
-        if steps is None:
-            return self
-        near = copy(self)
-        near._steps = steps
-        return near
 
     def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
         return self.log_likelihood(z) + self.prior.log_prob(z)

@@ -17,10 +17,11 @@ from torch.distributions.constraints import Constraint
 
 from avtorch.arrays import Float
 from avtorch.errors import InputError
+from avtorch.inference.chains import nested_rhat
 from avtorch.inference.density import Density, ScoredDensity, SelectableDensity
 from avtorch.inference.jerk import JerkDensity
 from avtorch.inference.map import find_mode
-from avtorch.inference.posterior import Posterior, nested_rhat
+from avtorch.inference.posterior import Posterior
 from avtorch.inference.priors import HalfNormalPrior, Joint, LogNormalPrior, LogSpaceNormal, Prior, QuadrantNormal
 from avtorch.vehicle.glvd import glvd_jerk
 

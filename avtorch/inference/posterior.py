@@ -12,6 +12,7 @@ from avtorch.arrays import Bool, Float
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.inference.arviz_export import UNITS, inference_data, parameter_table
+from avtorch.inference.chains import effective_sample_size, nested_rhat, normal_scores, quantiles_of
 from avtorch.inference.exactness import Exactness
 
 if TYPE_CHECKING:
@@ -132,70 +133,10 @@ class Posterior(Displayed):
 
     def quantile(self, q: float) -> Float[Tensor, "window parameter"]:
         """Posterior quantiles, ``(window, parameter)``."""
-        return quantile_of(self.flat, q)
+        return quantiles_of(self.flat, q)[0]
 
     def log_moments(self) -> tuple[Float[Tensor, "window parameter"], Float[Tensor, "window parameter parameter"]]:
         """Mean ``(window, parameter)`` and covariance ``(window, parameter, parameter)`` of the log parameters."""
         z = self.flat.log()
         centred = z - z.mean(0)
         return z.mean(0), torch.einsum("nwi,nwj->wij", centred, centred) / (len(z) - 1)
-
-
-def quantile_of(draws: Float[Tensor, "draw *rest"], q: float) -> Float[Tensor, "*rest"]:
-    """Quantile along the first dimension, linear between order statistics; no more is sorted than is needed."""
-    count = len(draws)
-    position = q * (count - 1)
-    low = int(position)
-    high = min(low + 1, count - 1)
-    if high < count // 4:
-        below = draws.topk(high + 1, 0, largest=False).values
-        pair = below[low], below[high]
-    elif low > count - count // 4:
-        above = draws.topk(count - low, 0).values
-        pair = above[count - 1 - low], above[count - 1 - high]
-    else:
-        ordered = draws.sort(0).values
-        pair = ordered[low], ordered[high]
-    return torch.lerp(*pair, position - low)
-
-
-def nested_rhat(draws: Float[Tensor, "chain draw *rest"], groups: int = 8) -> Float[Tensor, "*rest"]:
-    """Split nested R-hat (Margossian et al. 2024) over ``(chain, draw, ...)``; returns the remaining shape.
-
-    Many short chains are joined into ``groups`` superchains, cut into halves: the plain R-hat of chains of a few
-    autocorrelation times each is large even at stationarity. A common drift shows up between the halves, a chain in
-    another place between the groups.
-    """
-    chains, count = draws.shape[:2]
-    groups = max(1, min(groups, chains))
-    members, half = chains // groups, count // 2
-    used = draws[: groups * members, : 2 * half]
-    used = used - used[0, 0]  # near zero the sums below keep their digits
-    means, squares = [], []
-    for part in used.split(half, 1):
-        for table, x in ((means, part), (squares, part.square())):
-            table.append(x.sum(1).unflatten(0, (groups, members)).sum(1) / (members * half))
-    mean = torch.cat(means)  # (half x group, ...)
-    within = (torch.cat(squares) - mean.square()).mean(0)
-    between = mean.var(0)
-    return (1 + between / within.clamp_min(torch.finfo(draws.dtype).tiny)).sqrt()
-
-
-def normal_scores(draws: Float[Tensor, "chain draw *rest"]) -> Float[Tensor, "chain draw *rest"]:
-    """Each number's normal quantile by its rank among all chains' and draws', shape of ``draws``; ties as they come."""
-    flat = draws.flatten(0, 1)
-    rank = flat.argsort(0).argsort(0) + 1
-    return torch.special.ndtri((rank - 0.375) / (len(flat) + 0.25)).unflatten(0, draws.shape[:2])
-
-
-def effective_sample_size(values: Float[Tensor, "chain draw *rest"]) -> Float[Tensor, "*rest"]:
-    """Number of independent values that give the mean of ``(chain, draw, ...)`` as precisely; returns the remaining
-    shape.
-
-    By the means of independent chains, each cut into pieces where there are fewer than sixteen: short chains do not
-    determine their own autocorrelation. NaN where all values are equal.
-    """
-    chains, draws = values.shape[:2]
-    pieces = max(1, min(draws // 2, -(-16 // chains)))
-    means = values[:, : draws // pieces * pieces].unflatten(1, (pieces, -1)).mean(2).flatten(0, 1)
-    return values.flatten(0, 1).var(0) * len(means) / means.var(0)

@@ -7,86 +7,80 @@ Defaults: ``T_L ~ LogNormal(log 0.3, 0.7)``, ``K_L ~ LogNormal(log 1, 0.3)``,
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
-from avtorch.inference.exponential_form import PotentialTerms, terms_of
-from avtorch.inference.planes import join_planes
+from avtorch.inference.exponential_form import PotentialTerms
 from avtorch.vehicle.arguments import broadcast_shape
 
 _LOG_2PI = math.log(2 * math.pi)
 
 
-class Prior(Protocol):
-    """Log density over the last dimension of ``z``; ``select`` keeps the windows named by an index.
+@dataclass(frozen=True)
+class Prior(ABC):
+    """A prior of every window, over the last dimension of ``z``: its potential terms, and draws of it."""
 
-    One with a ``device`` and ``to(device)`` follows the data that it is used with; another has to be there already.
-    """
+    @abstractmethod
+    def terms(self, windows: int) -> PotentialTerms:
+        """Minus its log density, of so many windows."""
 
-    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]: ...
-
-    def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
-        """Gradient of ``log_prob``, shape of ``z``."""
-        ...
-
-    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Prior: ...
-
+    @abstractmethod
     def sample(
         self, count: int, windows: int, *, generator: torch.Generator | None = None
     ) -> Float[Tensor, "count window parameter"]:
         """Draws of ``z``, shape ``(count, window, parameter)``."""
-        ...
 
+    @abstractmethod
     def center(self) -> Float[Tensor, "*window parameter"]:
         """A typical ``z``, shape broadcastable to ``(window, parameter)``."""
-        ...
+
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Prior:
+        """That of the windows named by ``index``."""
+        return self
+
+    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
+        """Log density, ``(..., window)``."""
+        return -self.terms(z.shape[-2]).potential(z)
+
+    def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
+        """Gradient of ``log_prob``, shape of ``z``."""
+        return -self.terms(z.shape[-2]).slope(z)
+
+    @property
+    def device(self) -> torch.device:
+        return next(x.device for x in self._given() if isinstance(x, Tensor | Prior))
+
+    def to(self, device: torch.device) -> Self:
+        """The prior on a device."""
+        if self.device == device:
+            return self
+        return type(self)(*(x.to(device) if isinstance(x, Tensor | Prior) else x for x in self._given()))
+
+    def _given(self) -> list[Any]:
+        return [getattr(self, f.name) for f in fields(self)]
 
 
 @dataclass(frozen=True)
-class LogNormalPrior:
+class LogNormalPrior(Prior):
     """Independent log-normal parameters: ``log(parameter) ~ Normal(log median, log_sd)``; shapes ``(parameter,)``."""
 
     median: Float[Tensor, " parameter"]
     log_sd: Float[Tensor, " parameter"]
-    _log_median: Float[Tensor, " parameter"] = field(init=False, repr=False)
-    _precision: Float[Tensor, " parameter"] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("median", "log_sd"):
-            value = torch.as_tensor(getattr(self, name), dtype=torch.float64)
-            if not bool((value > 0).all()):
-                raise InputError(f"{name}: {value.tolist()} is not positive")
-            object.__setattr__(self, name, value)
-        object.__setattr__(self, "_log_median", self.median.log())
-        object.__setattr__(self, "_precision", self.log_sd.square().reciprocal())
+            object.__setattr__(self, name, _positive(name, getattr(self, name)))
 
-    def log_prob(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw"]:
-        score = (z - self.median.log()) / self.log_sd
-        return -0.5 * score.square().sum(-1) - self.log_sd.log().sum() - 0.5 * len(self.median) * _LOG_2PI
-
-    def score(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
-        return (self._log_median - z).mul_(self._precision)
-
-    def potential_terms(self, windows: int) -> PotentialTerms:
-        half = 0.5 * (self._precision * self._log_median.square()).sum()
-        constant = half + self.log_sd.log().sum() + 0.5 * len(self.median) * _LOG_2PI
-        linear, quadratic = -self._precision * self._log_median, self._precision.diag()
-        return PotentialTerms.of(windows, len(self.median), constant=constant, linear=linear, quadratic=quadratic)
-
-    @property
-    def device(self) -> torch.device:
-        return self.median.device
-
-    def to(self, device: torch.device) -> LogNormalPrior:
-        return LogNormalPrior(self.median.to(device), self.log_sd.to(device))
-
-    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> LogNormalPrior:
-        return self
+    def terms(self, windows: int) -> PotentialTerms:
+        d, precision = len(self.median), self.log_sd.square().reciprocal()
+        constant = self.log_sd.log().sum() + 0.5 * d * _LOG_2PI
+        return PotentialTerms.of(windows, d, constant=constant, center=self.median.log(), quadratic=precision.diag())
 
     def sample(
         self, count: int, windows: int, *, generator: torch.Generator | None = None
@@ -99,40 +93,18 @@ class LogNormalPrior:
 
 
 @dataclass(frozen=True)
-class HalfNormalPrior:
+class HalfNormalPrior(Prior):
     """Independent half-normal parameters with the given ``scale``, shape ``(parameter,)``."""
 
     scale: Float[Tensor, " parameter"]
-    _minus_precision: Float[Tensor, " parameter"] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        value = torch.as_tensor(self.scale, dtype=torch.float64)
-        if not bool((value > 0).all()):
-            raise InputError(f"scale: {value.tolist()} is not positive")
-        object.__setattr__(self, "scale", value)
-        object.__setattr__(self, "_minus_precision", -value.square().reciprocal())
+        object.__setattr__(self, "scale", _positive("scale", self.scale))
 
-    def log_prob(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw"]:
-        log_density = -0.5 * (z.exp() / self.scale).square() + z
-        return log_density.sum(-1) + len(self.scale) * 0.5 * math.log(2 / math.pi) - self.scale.log().sum()
-
-    def score(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
-        return (2 * z).exp_().mul_(self._minus_precision).add_(1)
-
-    def potential_terms(self, windows: int) -> PotentialTerms:
-        constant = self.scale.log().sum() - len(self.scale) * 0.5 * math.log(2 / math.pi)
-        square = -self._minus_precision
-        return PotentialTerms.of(windows, len(self.scale), constant=constant, linear=-1.0, own_square=square)
-
-    @property
-    def device(self) -> torch.device:
-        return self.scale.device
-
-    def to(self, device: torch.device) -> HalfNormalPrior:
-        return HalfNormalPrior(self.scale.to(device))
-
-    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> HalfNormalPrior:
-        return self
+    def terms(self, windows: int) -> PotentialTerms:
+        d, square = len(self.scale), self.scale.square().reciprocal()
+        constant = self.scale.log().sum() - 0.5 * d * math.log(2 / math.pi)
+        return PotentialTerms.of(windows, d, constant=constant, linear=-1.0, own_square=square)
 
     def sample(
         self, count: int, windows: int, *, generator: torch.Generator | None = None
@@ -145,7 +117,7 @@ class HalfNormalPrior:
 
 
 @dataclass(frozen=True)
-class QuadrantNormal:
+class QuadrantNormal(Prior):
     """Normal of ``variance`` around ``mean``, cut to the positive quadrant: the paper's ``N([K, T], lambda I)``.
 
     The paper (Sec. 3.2.3) does not define the mass below zero; here it is cut off and the rest renormalised.
@@ -156,38 +128,18 @@ class QuadrantNormal:
 
     mean: Float[Tensor, "window parameter"]
     variance: float
-    _log_mass: Float[Tensor, " window"] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not self.variance > 0:
             raise InputError(f"variance (lambda): {self.variance} is not positive")
-        inside = torch.special.log_ndtr(self.mean / math.sqrt(self.variance)).sum(-1)
-        object.__setattr__(self, "_log_mass", inside + 0.5 * self.mean.shape[-1] * (_LOG_2PI + math.log(self.variance)))
 
-    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
-        distance = (z.exp() - self.mean).square().sum(-1)
-        return -0.5 / self.variance * distance + z.sum(-1) - self._log_mass
-
-    def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
-        value = z.exp()
-        return 1 - value * (value - self.mean) / self.variance
-
-    def potential_terms(self, windows: int) -> PotentialTerms:
-        return PotentialTerms.of(
-            windows,
-            self.mean.shape[-1],
-            constant=0.5 / self.variance * self.mean.square().sum(-1) + self._log_mass,
-            linear=-1.0,
-            own_linear=-self.mean / self.variance,
-            own_square=1 / self.variance,
-        )
-
-    @property
-    def device(self) -> torch.device:
-        return self.mean.device
-
-    def to(self, device: torch.device) -> QuadrantNormal:
-        return QuadrantNormal(self.mean.to(device), self.variance)
+    def terms(self, windows: int) -> PotentialTerms:
+        d, precision = self.mean.shape[-1], 1 / self.variance
+        log_mass = torch.special.log_ndtr(self.mean / math.sqrt(self.variance)).sum(-1)
+        norm = 0.5 * d * (_LOG_2PI + math.log(self.variance))
+        constant = 0.5 * precision * self.mean.square().sum(-1) + log_mass + norm
+        own = {"own_linear": -precision * self.mean, "own_square": precision}
+        return PotentialTerms.of(windows, d, constant=constant, linear=-1.0, **own)
 
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> QuadrantNormal:
         return QuadrantNormal(self.mean[index], self.variance)
@@ -207,7 +159,7 @@ class QuadrantNormal:
 
 
 @dataclass(frozen=True)
-class LogSpaceNormal:
+class LogSpaceNormal(Prior):
     """Normal in ``z`` with full covariance: the whole posterior of a window as the prior of the next.
 
     `mean_z`: shape ``(window, parameter)``. `cov_z`: shape ``(window, parameter, parameter)``.
@@ -215,35 +167,12 @@ class LogSpaceNormal:
 
     mean_z: Float[Tensor, "window parameter"]
     cov_z: Float[Tensor, "window parameter parameter"]
-    _inverse: Float[Tensor, "window parameter parameter"] = field(init=False, repr=False)
-    _half_log_det: Float[Tensor, " window"] = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        lower = torch.linalg.cholesky(self.cov_z)
-        eye = torch.eye(lower.shape[-1], dtype=lower.dtype, device=lower.device).expand_as(lower)
-        object.__setattr__(self, "_inverse", torch.linalg.solve_triangular(lower, eye, upper=False))
-        object.__setattr__(self, "_half_log_det", lower.diagonal(dim1=-2, dim2=-1).log().sum(-1))
-
-    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
-        score = torch.einsum("wij,...wj->...wi", self._inverse, z - self.mean_z)
-        return -0.5 * score.square().sum(-1) - self._half_log_det - 0.5 * self.mean_z.shape[-1] * _LOG_2PI
-
-    def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
-        return -torch.einsum("wji,wjk,...wk->...wi", self._inverse, self._inverse, z - self.mean_z)
-
-    def potential_terms(self, windows: int) -> PotentialTerms:
-        d, mean = self.mean_z.shape[-1], self.mean_z
-        precision = self._inverse.mT @ self._inverse
-        linear = -(precision @ mean[..., None])[..., 0]
-        constant = -0.5 * (linear * mean).sum(-1) + self._half_log_det + 0.5 * d * _LOG_2PI
-        return PotentialTerms.of(windows, d, constant=constant, linear=linear, quadratic=precision)
-
-    @property
-    def device(self) -> torch.device:
-        return self.mean_z.device
-
-    def to(self, device: torch.device) -> LogSpaceNormal:
-        return LogSpaceNormal(self.mean_z.to(device), self.cov_z.to(device))
+    def terms(self, windows: int) -> PotentialTerms:
+        d, lower = self.mean_z.shape[-1], torch.linalg.cholesky(self.cov_z)
+        constant = lower.diagonal(dim1=-2, dim2=-1).log().sum(-1) + 0.5 * d * _LOG_2PI
+        quadratic = torch.cholesky_inverse(lower)
+        return PotentialTerms.of(windows, d, constant=constant, center=self.mean_z, quadratic=quadratic)
 
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> LogSpaceNormal:
         return LogSpaceNormal(self.mean_z[index], self.cov_z[index])
@@ -259,28 +188,14 @@ class LogSpaceNormal:
 
 
 @dataclass(frozen=True)
-class Joint:
+class Joint(Prior):
     """Independent blocks: ``actuation`` over ``(T_L, K_L)``, the first two parameters, and ``noise`` over the rest."""
 
     actuation: Prior
     noise: Prior
 
-    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
-        return self.actuation.log_prob(z[..., :2]) + self.noise.log_prob(z[..., 2:])
-
-    def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
-        return join_planes(self.actuation.score(z[..., :2]), self.noise.score(z[..., 2:]))
-
-    def potential_terms(self, windows: int) -> PotentialTerms | None:
-        first, rest = terms_of(self.actuation, windows), terms_of(self.noise, windows)
-        return None if first is None or rest is None else first.beside(rest)
-
-    @property
-    def device(self) -> torch.device | None:
-        return getattr(self.noise, "device", None)
-
-    def to(self, device: torch.device) -> Joint:
-        return Joint(prior_on(self.actuation, device), prior_on(self.noise, device))
+    def terms(self, windows: int) -> PotentialTerms:
+        return self.actuation.terms(windows).beside(self.noise.terms(windows))
 
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Joint:
         return Joint(self.actuation.select(index), self.noise.select(index))
@@ -298,29 +213,15 @@ class Joint:
 
 
 @dataclass(frozen=True)
-class Switch:
+class Switch(Prior):
     """Window by window one of two priors: ``later`` where ``started``, shape ``(window,)``, else ``first``."""
 
     started: Bool[Tensor, " window"]
     first: Prior
     later: Prior
 
-    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
-        return torch.where(self.started, self.later.log_prob(z), self.first.log_prob(z))
-
-    def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
-        return torch.where(self.started[:, None], self.later.score(z), self.first.score(z))
-
-    def potential_terms(self, windows: int) -> PotentialTerms | None:
-        first, later = terms_of(self.first, windows), terms_of(self.later, windows)
-        return None if first is None or later is None else later.where(self.started, first)
-
-    @property
-    def device(self) -> torch.device | None:
-        return getattr(self.first, "device", None)
-
-    def to(self, device: torch.device) -> Switch:
-        return Switch(self.started.to(device), prior_on(self.first, device), prior_on(self.later, device))
+    def terms(self, windows: int) -> PotentialTerms:
+        return self.later.terms(windows).where(self.started, self.first.terms(windows))
 
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Prior:
         started = self.started[index]
@@ -340,12 +241,11 @@ class Switch:
         return torch.where(self.started[:, None], self.later.center(), self.first.center())
 
 
-def prior_on(prior: Prior, device: torch.device) -> Prior:
-    """The prior on a device; itself where it is there, or where it knows of none."""
-    here = getattr(prior, "device", None)
-    if here is None or here == device:
-        return prior
-    return prior.to(device)  # pyright: ignore[reportAttributeAccessIssue]
+def _positive(name: str, value: Any) -> Tensor:
+    checked = torch.as_tensor(value, dtype=torch.float64)
+    if not bool((checked > 0).all()):
+        raise InputError(f"{name}: {checked.tolist()} is not positive")
+    return checked
 
 
 def _like(x: Tensor) -> dict[str, Any]:

@@ -8,14 +8,13 @@ from torch.optim import Optimizer
 
 from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
-from avtorch.inference.compiled import chosen
-from avtorch.inference.coordinates import Coordinates, score_of, stiffness
-from avtorch.inference.density import Density, SubsampledDensity, constrained, has_selection, selected
+from avtorch.inference.compiled import compiled_form, compiled_walk
+from avtorch.inference.coordinates import Coordinates, stiffness
+from avtorch.inference.density import Density, SubsampledDensity, constrained, has_selection, score_of, selected
 from avtorch.inference.device import check_generator
-from avtorch.inference.exactness import TAIL, Exactness, Moments, compare_with_exact, pieces_of, root_of
+from avtorch.inference.exactness import CACHED, Exactness, Moments, compare_with_exact
 from avtorch.inference.map import Mode, find_mode
-from avtorch.inference.planes import empty_planes
-from avtorch.inference.posterior import Posterior, nested_rhat
+from avtorch.inference.posterior import Posterior
 from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.inference.sgld import SGLD
 
@@ -83,22 +82,21 @@ def sample(
             coordinates, w = _walk(part, where, settings.slower(times), slowdown[index], generator)
             fresh = torch.isin(index, open_)
             new = index[fresh]
-            rhat, far, moments = _summary(part, settings, coordinates, w)
-            diverged[new] = _diverged(part, where, coordinates.z(far))[fresh]
-            unmixed[new] = ~(rhat.amax(-1) <= limit)[fresh]  # NaN counts as not converged
+            z = coordinates.z(w).transpose(0, 1)
+            moments = Moments.of(z)
+            diverged[new] = _diverged(part, where, coordinates.z(_furthest(w)))[fresh]
+            unmixed[new] = ~(moments.rhat.amax(-1) <= limit)[fresh]  # NaN counts as not converged
             stuck[new] = (slowdown[new] > STUCK) | _too_wide(where, settings, slowdown[index], times)[fresh]
-            z = coordinates.z(w)
             values = constrained(density, z)
             draws[:, :, new] = values if len(new) == len(index) else values[:, :, fresh]
             if settings.compare:
-                found = found.put(
-                    index, compare_with_exact(part, z, eager=settings.walk == "eager", moments=moments), fresh
-                )
+                total = settings.chains * settings.draws
+                found = found.put(index, compare_with_exact(part, moments, total), fresh)
         slowdown = 2 * slowdown
         again = diverged | unmixed
         if settings.compare:
             # a second run may reach what the first did not; where it changed nothing, half the step will not either
-            again |= ~found.holds() if attempt == 0 else ~(found.holds() | found.hopeless())
+            again |= ~found.holds if attempt == 0 else ~(found.holds | found.hopeless)
         open_ = again.nonzero().squeeze(-1)
         if not len(open_):
             break
@@ -181,19 +179,13 @@ def _batches(density: Density, index: Tensor, slowdown: Tensor, chains: int) -> 
     return batches
 
 
-def _summary(
-    density: Density, settings: SamplerSettings, coordinates: Coordinates, w: Float[Tensor, "chain draw window d"]
-) -> tuple[Float[Tensor, "window d"], Float[Tensor, "window d"], Moments | None]:
-    """Nested R-hat of draws, the furthest of each window, ``(window, d)`` both, and their moments if compiled."""
-    chains, draws, windows, _ = w.shape
-    loops = chosen(density, settings)
-    if loops is not None:
-        rhat, far, mean, covariance, *rest = loops.summarised(coordinates, w, 8, pieces_of(chains, draws), TAIL)
-        return rhat, far, Moments(mean, root_of(covariance), *rest)
-    distance = w.square().sum(-1).nan_to_num_(nan=torch.inf)
-    furthest = distance.transpose(0, 1).flatten(0, 1).argmax(0)  # in the order of memory
-    far = w.transpose(0, 1).flatten(0, 1)[furthest, torch.arange(windows, device=w.device)]
-    return nested_rhat(w), far, None
+def _furthest(w: Float[Tensor, "draw chain window d"]) -> Float[Tensor, "window d"]:
+    """The draw of each window that is furthest from ``w = 0``, one that is no number if there is any."""
+    planes = w.permute(2, 3, 0, 1).flatten(2)
+    size = len(planes) if w.is_cuda else max(1, CACHED // planes[0].numel())
+    # a NaN is the largest
+    at = torch.cat([part.square().sum(1).argmax(-1) for part in planes.split(size)])
+    return planes[torch.arange(len(planes), device=w.device), :, at]
 
 
 def _diverged(
@@ -223,24 +215,28 @@ def walk(
     """
     slowdown = stiffness(density, Coordinates.of(mode, settings.whitening)) if slowdown is None else slowdown
     coordinates, w = _walk(density, mode, settings, slowdown, generator)
-    return coordinates.z(w)
+    return coordinates.z(w).transpose(0, 1)
 
 
 def _walk(
     density: Density, mode: Mode, settings: SamplerSettings, slowdown: Tensor, generator: torch.Generator | None
 ) -> tuple[Coordinates, Tensor]:
-    """Draws ``(chain, draw, window, d)`` in the coordinates returned with them."""
+    """Draws ``(draw, chain, window, d)`` in the coordinates returned with them.
+
+    In memory they are parameter by parameter and window by window, as arithmetic is quickest.
+    """
     # each window's own step is folded into its scale
     coordinates = Coordinates.of(mode, settings.whitening).slowed(slowdown)
-    shape = (settings.chains, *mode.z.shape)
-    w = empty_planes(*shape, dtype=mode.z.dtype, device=mode.z.device).zero_()
+    windows, d = mode.z.shape
+    start = mode.z.new_zeros(d, windows, settings.chains)
+    w = start.permute(2, 1, 0)
     if settings.spread > 0:
-        start = torch.randn(shape, dtype=w.dtype, device=w.device, generator=generator)
-        w += settings.spread * slowdown.sqrt()[:, None] * start
-    loops = chosen(density, settings)
-    if loops is not None:
-        kept = loops.draws(coordinates, w, settings, TAMED, generator)
-        return coordinates, kept.transpose(0, 1)
+        normal = torch.randn(w.shape, dtype=w.dtype, device=w.device, generator=generator)
+        w += settings.spread * slowdown.sqrt()[:, None] * normal
+    form = compiled_form(density, settings)
+    if form is not None:
+        kept = compiled_walk(form, coordinates, start, settings, TAMED, generator)
+        return coordinates, kept.permute(2, 3, 1, 0)
     w.requires_grad_()
     if settings.optimizer is None:
         options = {"noise": settings.noise, "noise_dtype": torch.float32}
@@ -250,7 +246,7 @@ def _walk(
     scheduler = None if settings.schedule is None else settings.schedule(optimizer)
     state = w.detach()
     graph = any(group.get("preconditioner") for group in optimizer.param_groups)
-    kept = empty_planes(settings.draws, *shape, dtype=w.dtype, device=w.device)
+    kept = start.new_empty(d, windows, settings.draws, settings.chains).permute(2, 3, 1, 0)
 
     def closure() -> Tensor | None:
         if graph:  # differentiates the potential itself, and again
@@ -269,7 +265,7 @@ def _walk(
         collected = k + 1 - settings.burn_in
         if collected > 0 and collected % settings.thinning == 0:
             kept[collected // settings.thinning - 1] = w.detach()
-    return coordinates, kept.transpose(0, 1)
+    return coordinates, kept
 
 
 def _log_prob(density: Density, z: Tensor, batch: int | None, generator: torch.Generator | None) -> Tensor:

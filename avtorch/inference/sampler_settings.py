@@ -44,9 +44,9 @@ class SamplerSettings:
         compare: compare the draws with the exact density (:mod:`avtorch.inference.exactness`), also with a minibatch, a
             schedule or another optimizer. Set it to false only for a density too expensive to evaluate at some hundred
             points; ``converged`` then means only that the chains agree with each other.
-        walk: ``"auto"`` compiles the walk where density and settings allow it and numba is installed
-            (:mod:`avtorch.inference.compiled`), ``"eager"`` always steps with :class:`SGLD`, the reference, and
-            ``"compiled"`` is an error where it cannot be had. Both have the same law; a seed gives each its own draws.
+        walk: ``"auto"`` compiles the walk where density and settings allow it (:mod:`avtorch.inference.compiled`),
+            ``"eager"`` always steps with :class:`SGLD`, the reference. Both have the same law; a seed gives each
+            its own draws.
 
     Raises `InputError` naming the setting that is out of range.
 
@@ -72,7 +72,7 @@ class SamplerSettings:
     whitening: Whitening = "full"
     optimizer: MakeOptimizer | None = None
     compare: bool = True
-    walk: Literal["auto", "compiled", "eager"] = "auto"
+    walk: Literal["auto", "eager"] = "auto"
 
     def __post_init__(self) -> None:
         for name, least in (("chains", 1), ("draws", 4), ("burn_in", 0), ("thinning", 1), ("attempts", 1)):
@@ -88,8 +88,8 @@ class SamplerSettings:
             raise InputError(f"longest: {self.longest} is not 1 or more")
         if self.whitening not in ("full", "diagonal", "none"):
             raise InputError(f"whitening: {self.whitening!r} is none of 'full', 'diagonal', 'none'")
-        if self.walk not in ("auto", "compiled", "eager"):
-            raise InputError(f"walk: {self.walk!r} is none of 'auto', 'compiled', 'eager'")
+        if self.walk not in ("auto", "eager"):
+            raise InputError(f"walk: {self.walk!r} is neither 'auto' nor 'eager'")
 
     def slower(self, times: float) -> SamplerSettings:
         """The same settings with ``times`` as many steps, for a step that is ``times`` shorter.

@@ -11,10 +11,10 @@ from torch import Tensor
 from avtorch.arrays import Bool
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief, Summary
+from avtorch.inference.chains import quantiles_of
 from avtorch.inference.density import Density
 from avtorch.inference.estimator import Estimator
 from avtorch.inference.form import Rows, WindowLikelihood
-from avtorch.inference.posterior import quantile_of
 from avtorch.inference.priors import (
     Joint,
     LogSpaceNormal,
@@ -128,9 +128,9 @@ class SequentialInference(Estimator):
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
         """Posterior of some vehicles: its summary, log moments, and where it converged ``(vehicle,)`` bool."""
         posterior = sample(density, self.settings, generator=self.generator)
-        quantiles = quantile_of(posterior.flat, 0.05), quantile_of(posterior.flat, 0.95)
+        q05, q95 = quantiles_of(posterior.flat, 0.05, 0.95)
         draws = _thin(posterior.flat, self.kept)
-        summary = Summary(posterior.mean, posterior.sd, *quantiles, draws)
+        summary = Summary(posterior.mean, posterior.sd, q05, q95, draws)
         return summary, *posterior.log_moments(), posterior.converged
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Saved states against those who load them: of the same parameters, vehicles and draws, or refused as a whole.
 
-What was damaged on its way is found by the checksum of the stream that it belongs to.
+What was damaged on its way is found by the checksum of the file that holds it.
 """
 
 from __future__ import annotations
@@ -37,15 +37,6 @@ def shaped_as(own: Any, given: Any, place: str) -> None:
             raise InputError(f"{place}: found {len(given)} entries, needs {len(own)}")
         for i, value in enumerate(own):
             shaped_as(value, given[i], f"{place}[{i}]")
-
-
-def about(state: Any, *more: str) -> tuple[Any, ...]:
-    """The identity of a state: the values of `more`, the parameters' names, the number of vehicles; None where
-    missing."""
-    given = state if isinstance(state, dict) else {}
-    names, mean = given.get("names"), given.get("mean")
-    plain = tuple(str(name)[:40] for name in names) if isinstance(names, (list, tuple)) else None
-    return *(given.get(key) for key in more), plain, len(mean) if isinstance(mean, Tensor) and mean.ndim else None
 
 
 def _kind(x: Any) -> str:

@@ -1,7 +1,4 @@
-"""Samples in, one posterior per window out: the online form of the sequential loop, with a bounded memory.
-
-Its state between two rows has a checksum, and may be kept in a file.
-"""
+"""Samples in, one posterior per window out: the online form of the sequential loop, with a bounded memory."""
 
 from __future__ import annotations
 
@@ -10,7 +7,6 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -23,58 +19,12 @@ from avtorch.display import Card, Displayed
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief
 from avtorch.inference.device import Device, checked_device
-from avtorch.inference.estimators.choose import make_estimator
+from avtorch.inference.estimators import make_estimator
 from avtorch.inference.form import Form, JerkForm
 from avtorch.inference.stream_units import StreamUnits
-from avtorch.io import Damaged, fingerprint, read_sealed_bytes, write_sealed
+from avtorch.io import Damaged
 from avtorch.io.clock import ROUNDING_S, decimals
 from avtorch.io.engagement import settled_rows
-
-SCHEMA = "avtorch.belief_stream/1"
-MOST = 2**30
-"""Maximum size of a state [bytes]."""
-
-_REMEDY = "needs a state as it was saved; begin with a new stream, or load another"
-
-
-def with_checksum(state: Mapping[str, Any]) -> dict[str, Any]:
-    """The state with the fingerprint of its content, under `sha256`."""
-    return {**state, "sha256": fingerprint(state)}
-
-
-def without_checksum(state: Any) -> dict[str, Any]:
-    """The state, once its fingerprint is found right.
-
-    Raises `InputError` for a state that was changed since it was made, or that carries no fingerprint.
-    """
-    if not isinstance(state, dict) or not isinstance(state.get("sha256"), str):
-        raise InputError("state: carries no checksum, as one damaged, or saved by an earlier avtorch; " + _REMEDY)
-    rest = {key: value for key, value in state.items() if key != "sha256"}
-    try:
-        found = fingerprint(rest)
-    except (TypeError, ValueError, RuntimeError, RecursionError):
-        found = None
-    if found != state["sha256"]:
-        raise InputError("state: is damaged or was changed: its checksum is not that of its content; " + _REMEDY)
-    return rest
-
-
-def write_state(path: str | PathLike[str], state: Mapping[str, Any]) -> None:
-    """Write a state so that the file is complete or unchanged.
-
-    Raises `InputError` where the place cannot be written, or is a symlink, a folder or a device.
-    """
-    of = {key: state[key] for key in ("estimator", "form", "window", "vehicles")}
-    write_sealed(Path(path), packed(state), schema=SCHEMA, of=of)
-
-
-def read_state(path: str | PathLike[str]) -> dict[str, Any]:
-    """Read what :func:`write_state` wrote; only tensors and plain values are read, no code is run.
-
-    Raises `InputError` for any file that is not exactly as written.
-    """
-    content = read_sealed_bytes(Path(path), schema=SCHEMA, most=MOST, remedy=_REMEDY).content
-    return unpacked(content, Path(path), _REMEDY)
 
 
 def packed(state: Mapping[str, Any]) -> bytes:
@@ -387,24 +337,21 @@ class BeliefStream:
         return {"time": torch.empty(0, dtype=torch.float64), "usable": usable, **rows}
 
     def state_dict(self) -> dict[str, Any]:
-        """The open window's rows and the belief: all that a resumed stream needs to continue bit for bit.
-
-        Under ``sha256`` it carries its own checksum.
-        """
+        """The open window's rows and the belief: all that a resumed stream needs to continue bit for bit."""
         clock = {"origin": self._origin, "index": self._index, "last": self._last, "window": self.window}
         clock["driven"] = list(self._driven)
         clock["epoch"] = self._epoch
         own = {"estimator": self.estimator, "form": type(self.form).__name__, "vehicles": self.vehicles}
         own["units"] = None if self._units is None else self._units.state_dict()
-        return with_checksum({"rows": dict(self._rows), **clock, **own, "inference": self.inference.state_dict()})
+        return {"rows": dict(self._rows), **clock, **own, "inference": self.inference.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`. Where it is refused, the stream is unchanged.
 
-        Raises `InputError` if it was saved by a stream of another window length, form, estimator or number of vehicles,
-        or was changed since, by its checksum.
+        Raises `InputError` if it was saved by a stream of another window length, form, estimator or number of vehicles.
         """
-        state = without_checksum(state)
+        if not isinstance(state, dict):
+            raise InputError(f"state: found a {type(state).__name__}, needs what a stream saves")
         own = {"estimator": self.estimator, "form": type(self.form).__name__, "window": self.window}
         for name, value in {**own, "vehicles": self.vehicles}.items():
             if type(state.get(name)) is not type(value) or state[name] != value:
@@ -429,24 +376,6 @@ class BeliefStream:
         self._origin, self._index, self._last = state["origin"], state["index"], state["last"]
         self._driven = list(state["driven"])
         self._epoch = state["epoch"]
-
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write :meth:`state_dict` to a file, with a checksum, so that the file is complete or unchanged.
-
-        Raises `InputError` where the place cannot be written, or is a symlink, a folder or a device.
-        """
-        write_state(path, self.state_dict())
-
-    def load(self, path: str | PathLike[str]) -> None:
-        """Read what :meth:`save` wrote; only tensors and plain values are read, no code is run.
-
-        Raises `InputError` that names the file, for anything else; the stream is then unchanged.
-        """
-        state = read_state(path)
-        try:
-            self.load_state_dict(state)
-        except InputError as fault:
-            raise InputError(f"{path}: {fault}") from None
 
 
 def _moment(time: float, epoch: float | None) -> str:

@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference.coordinates import score_of
-from avtorch.inference.density import Density
+from avtorch.inference.density import Density, score_of
 from avtorch.inference.map import Mode, find_mode
 
 #: Numbers of a kernel matrix at once, over windows.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import torch
@@ -52,6 +53,10 @@ class Performance:
     comfort_share: Float[Tensor, "*scenario"]
     energy_jpkgm: Float[Tensor, "*scenario"]
     throughput_vph: Float[Tensor, "*scenario"]
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Performance:
+        """`change` of every measure."""
+        return Performance(*(change(getattr(self, f.name)) for f in fields(self)))
 
     def row(self, *index: int) -> dict[str, float | None]:
         """One scenario's (or vehicle's) figures by name; a number that is not finite is None, for JSON."""

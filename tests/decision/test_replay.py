@@ -39,7 +39,7 @@ def test_the_setting_in_force_does_again_what_it_did():
     assert float(seen.jerk_rms_mps3) == pytest.approx(float(truth.jerk_rms_mps3), rel=1e-3)
     assert float(seen.clipped_share) == float(truth.clipped_share)
     assert float(seen.throughput_vph) == pytest.approx(float(truth.throughput_vph), rel=1e-9)
-    assert float(seen.mean_spacing_m) == pytest.approx(float(block.spacing.mean()), rel=1e-4)
+    assert float(seen.energy_jpkgm) == pytest.approx(float(truth.energy_jpkgm), rel=1e-3)
 
 
 def test_limits_are_the_vehicles_and_only_grow_the_clipping():
@@ -65,17 +65,18 @@ def test_limits_are_the_vehicles_and_only_grow_the_clipping():
 
 
 def test_a_gap_that_opens_slowly_and_a_driver_who_takes_time():
-    history = History.of_blocks([drive()])
+    """Behind a leader who brakes: the wider the gap has become by then, the more room is left."""
+    history = History.of_blocks([drive(start=120.0)])
 
-    def spacing(**how):
-        seen = replay(
-            history, Setting(time_gap=2.5)[:, None], T_L=column(0.3), K_L=column(1.0), time_gap_now=column(1.0), **how
-        )
-        return float(seen.mean_spacing_m), float(seen.clipped_share)
+    def seen(time_gap=2.5, **how):
+        setting = Setting(time_gap=time_gap)[:, None]
+        return replay(history, setting, T_L=column(0.3), K_L=column(1.0), time_gap_now=column(1.0), **how)
 
-    slow, fast, late = spacing(), spacing(ramp_rate=1e3), spacing(delay=10.0)
-    assert fast[0] > slow[0] > late[0]
-    assert fast[1] >= slow[1]
+    slow, fast, late = seen(), seen(ramp_rate=1e3), seen(delay=10.0)
+    assert float(fast.min_spacing_m) > float(slow.min_spacing_m) > float(late.min_spacing_m)
+    assert float(fast.clipped_share) > float(slow.clipped_share)
+    never, kept = seen(delay=100.0), seen(time_gap=1.0)
+    assert float(never.min_spacing_m) == float(kept.min_spacing_m)
 
 
 def test_a_scenario_is_predicted_alike_in_any_company():

@@ -45,10 +45,11 @@ class Gaussian:
     def initial(self):
         return torch.zeros(self.windows, 3, dtype=F64)
 
+    @property
     def exponential_form(self):
         terms = PotentialTerms.of(self.windows, 3, quadratic=self.precision)
-        none = torch.zeros(self.windows, 3, 3, dtype=F64)
-        return ExponentialForm(terms, torch.zeros(3, 3, dtype=F64), torch.zeros(3, dtype=F64), none)
+        none = torch.zeros_like(self.precision)
+        return ExponentialForm(terms, torch.zeros(3, 3, dtype=F64), none)
 
 
 def priors(windows: int):

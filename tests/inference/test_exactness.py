@@ -24,9 +24,9 @@ from avtorch.inference import (
     integrate,
     sample,
 )
+from avtorch.inference.chains import effective_sample_size, normal_scores
 from avtorch.inference.exactness import Moments, weighed
 from avtorch.inference.importance import pareto_k
-from avtorch.inference.posterior import effective_sample_size, normal_scores
 from avtorch.inference.sgld import harmonic
 from avtorch.validation.windows import synthetic_windows
 from benchmarks.torch_density import TorchDensity

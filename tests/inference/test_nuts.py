@@ -172,6 +172,6 @@ def test_bad_input_names_itself(make_windows) -> None:
     data = LatentWindow.single(w.time, w.u[0], accel=w.a[0])
     with pytest.raises(InputError, match="samples"):
         PyroModel(LatentDensity(data), samples=(w.a[0], w.u[0], w.jerk[0]))
-    unknown = SimpleNamespace(select=lambda index: unknown)
+    unknown = SimpleNamespace(select=lambda index: unknown, to=lambda device: unknown)
     with pytest.raises(InputError, match="prior: no Pyro"):
         PyroModel(JerkDensity(w.statistics, unknown))  # type: ignore[arg-type]

@@ -222,7 +222,7 @@ def test_resume_is_equal_to_the_bit(mode, make_windows):
 )
 def test_a_state_of_another_loop_is_refused(other):
     state = SequentialInference(vehicles=2).state_dict()
-    with pytest.raises(InputError, match=r"^state: "):
+    with pytest.raises(InputError, match=r"^state[:.]"):
         SequentialInference(**{"vehicles": 2, **other}).load_state_dict(state)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.inference import BeliefStream, SamplerSettings, Window
+from avtorch.inference.stream import packed, unpacked
 
 F64 = torch.float64
 SMALL = SamplerSettings(chains=8, draws=16, burn_in=4)
@@ -57,7 +59,7 @@ def test_windows_lie_on_the_logs_own_clock(drive):
 @pytest.mark.slow
 @settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.integers(0, 600), max_size=12), st.integers(0, 12))
-def test_neither_cuts_nor_saving_change_a_bit(drive, tmp_path_factory, cuts, save_at):
+def test_neither_cuts_nor_saving_change_a_bit(drive, cuts, save_at):
     whole = new()
     expected = whole.feed(*block(drive, slice(0, 600)), until=6.0)
     assert len(expected) == 3
@@ -66,10 +68,9 @@ def test_neither_cuts_nor_saving_change_a_bit(drive, tmp_path_factory, cuts, sav
     for k, (first, last) in enumerate(pairwise(edges)):
         windows += stream.feed(*block(drive, slice(first, last)))
         if k == save_at:
-            path = tmp_path_factory.mktemp("state") / "stream.pt"
-            stream.save(path)
+            state = packed(stream.state_dict())
             stream = new(seed=99)
-            stream.load(path)
+            stream.load_state_dict(unpacked(state, Path("state"), ""))
     windows += stream.flush()
     assert_same(expected, windows)
 
@@ -235,7 +236,7 @@ def test_a_state_of_another_stream_is_refused():
 @pytest.mark.slow
 @settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.integers(0, 1000), max_size=8), st.integers(0, 8))
-def test_a_driver_masks_his_rows_and_the_settling_after_them(drive, tmp_path_factory, cuts, save_at):
+def test_a_driver_masks_his_rows_and_the_settling_after_them(drive, cuts, save_at):
     """One vehicle of two is taken over: what it holds then and in the 2 s after may be anything, however it is cut."""
     time, columns = block(drive, slice(None))
     engaged = torch.ones(2, 1000, dtype=torch.bool)
@@ -252,10 +253,9 @@ def test_a_driver_masks_his_rows_and_the_settling_after_them(drive, tmp_path_fac
         on = None if bool(engaged[:, part].all()) else engaged[:, part]
         windows += stream.feed(time[part], {n: c[:, part] for n, c in garbled.items()}, engaged=on)
         if k == save_at:
-            path = tmp_path_factory.mktemp("state") / "stream.pt"
-            stream.save(path)
+            state = packed(stream.state_dict())
             stream = new(seed=99)
-            stream.load(path)
+            stream.load_state_dict(unpacked(state, Path("state"), ""))
     assert_same(expected, windows + stream.feed(time[:0], {n: c[:, :0] for n, c in columns.items()}, until=10.0))
 
 

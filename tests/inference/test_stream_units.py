@@ -177,7 +177,7 @@ def test_a_sign_flip_is_not_believed(fresh_seed):
 
 
 @pytest.mark.slow
-def test_cuts_and_saving_change_nothing(tmp_path, fresh_seed):
+def test_cuts_and_saving_change_nothing(fresh_seed):
     """The same refusal, word for word, and the prior's belief after it, however the rows come."""
     time, given = drive(fresh_seed, seconds=24.0)
     given = changed(given, accel_cmd=-1.0)
@@ -192,9 +192,9 @@ def test_cuts_and_saving_change_nothing(tmp_path, fresh_seed):
                 assert found.inference.belief.draws.equal(prior)
                 return str(refused)
             if save:
-                found.save(tmp_path / "state.pt")
+                state = found.state_dict()
                 found = stream(seed=99)
-                found.load(tmp_path / "state.pt")
+                found.load_state_dict(state)
         return "none"
 
     said = {refusal(size, save) for size, save in ((2400, False), (37, False), (400, True))}
@@ -234,7 +234,7 @@ def test_the_memory_of_a_stretch_is_bounded():
         usable = torch.ones(1, 200, dtype=torch.bool)
         found.take({"time": time + 2.0 * k, "usable": usable, **dict.fromkeys(JERK, zero)}, {})
         kept.append(found.rows["time"].shape[-1] if found.rows else 0)
-    assert max(kept) < 40 / 0.05 + 50
+    assert max(kept) < 40 / 0.01 + 250
 
 
 @pytest.mark.parametrize("lap", [1, 2, 3])

@@ -179,27 +179,30 @@ def test_answer_of_synthetic_windows(windows: Windows, quick_nuts: None) -> None
     assert dict(groups["quadrature"].posterior.sizes) == {"chain": 4, "draw": 500, "window": 4}
 
 
-class ManyNoises(JerkDensity):
+class ManyNoises:
     """A jerk density with a fourth parameter: more than a grid can integrate."""
 
-    names = ("T_L", "K_L", "process_noise", "coloured_sd")  # type: ignore[assignment]
+    names = ("T_L", "K_L", "process_noise", "coloured_sd")
+
+    def __init__(self, of: JerkDensity) -> None:
+        self.of, self.prior, self.windows = of, of.prior, of.windows
 
     def log_prob(self, z: torch.Tensor) -> torch.Tensor:
-        return super().log_prob(z[..., :3]) - 0.5 * ((z[..., 3] + 1) / 0.3).square()
+        return self.of.log_prob(z[..., :3]) - 0.5 * ((z[..., 3] + 1) / 0.3).square()
 
     def score(self, z: torch.Tensor) -> torch.Tensor:
-        return torch.cat([super().score(z[..., :3]), -(z[..., 3:] + 1) / 0.09], -1)
+        return torch.cat([self.of.score(z[..., :3]), -(z[..., 3:] + 1) / 0.09], -1)
 
     def select(self, index: torch.Tensor) -> ManyNoises:
-        return ManyNoises(self.statistics.select(index), self.prior.select(index))
+        return ManyNoises(self.of.select(index))
 
     def initial(self) -> torch.Tensor:
-        return torch.cat([super().initial(), torch.full((self.windows, 1), -1.0, dtype=torch.float64)], -1)
+        return torch.cat([self.of.initial(), torch.full((self.windows, 1), -1.0, dtype=torch.float64)], -1)
 
 
 def test_nuts_is_the_reference_where_quadrature_cannot_be(windows: Windows, quick_nuts: None, tmp_path) -> None:
     assert isinstance(windows.density, JerkDensity)
-    density = ManyNoises(windows.density.statistics, windows.density.prior)
+    density = ManyNoises(windows.density)
     source = replace(windows, name="drive.csv", form="latent", density=density, truth=None)
     found = validate(source, nuts_windows=3)
     assert found.reference == "nuts"

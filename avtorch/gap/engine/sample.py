@@ -39,10 +39,10 @@ from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import TEMPER
 from avtorch.gap.engine.surrogate import Corrected, Surrogate, terms_of
 from avtorch.gap.engine.torch_plant import not_in_torch
+from avtorch.inference.chains import effective_sample_size
 from avtorch.inference.coordinates import Coordinates, stiffness
 from avtorch.inference.importance import ImportanceSettings, reliable, weighted_draws
 from avtorch.inference.map import Mode, find_mode
-from avtorch.inference.posterior import effective_sample_size
 from avtorch.inference.sampler import sample as walk
 from avtorch.inference.sampler_settings import SamplerSettings
 

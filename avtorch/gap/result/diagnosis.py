@@ -19,7 +19,7 @@ from avtorch.gap.result.findings import Findings
 from avtorch.gap.result.hypotheses import plausibility
 from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.gap.simulator.plant import GapPlant
-from avtorch.inference.posterior import effective_sample_size, nested_rhat, normal_scores
+from avtorch.inference.chains import effective_sample_size, nested_rhat, normal_scores
 from avtorch.io import Log, answer_set, atomic, write_json
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -26,7 +26,7 @@ from torch import Tensor
 from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.inference.belief import Summary
-from avtorch.inference.estimators.windowed import WindowedEstimator
+from avtorch.inference.estimator import WindowedEstimator
 from avtorch.inference.form import Form, JerkForm, Rows
 from avtorch.inference.jerk import JerkStatistics
 from avtorch.inference.latent import GAP, NOISE_PRIOR, LatentForm
@@ -219,14 +219,32 @@ class JointKalman(WindowedEstimator):
         }
 
     @abstractmethod
+    def through(
+        self, function: Callable[[Tensor], Tensor], slope: Callable[[Tensor], Tensor], state: GaussianState
+    ) -> tuple[Float[Tensor, "vehicle e"], Float[Tensor, "vehicle e e"], Float[Tensor, "vehicle d e"]]:
+        """Mean and covariance of a function of the state, and its covariance with the state; ``slope``: its derivative,
+        ``(..., vehicle, e, d)``."""
+
     def predict(self, model: StateModel, state: GaussianState, row: Observation) -> GaussianState:
         """The state at the next row."""
+        mean, cov, _ = self.through(lambda x: model.advance(x, row), lambda x: model.slope(x, row), state)
+        return GaussianState(mean, cov + model.noise(state.mean, row))
 
-    @abstractmethod
     def correct(
         self, model: StateModel, state: GaussianState, row: Observation, channel: int
     ) -> tuple[GaussianState, Float[Tensor, " vehicle"]]:
         """The state after one channel's reading, and the log likelihood of the reading, ``(vehicle,)``."""
+        expected, spread, pointing = self.through(
+            lambda x: model.observe(x, row, channel).unsqueeze(-1),
+            lambda x: model.observed_slope(x, row, channel).unsqueeze(-2),
+            state,
+        )
+        spread = spread[:, 0, 0] + model.variance[:, channel]
+        innovation = row.measured[:, channel] - expected[:, 0]
+        gain = pointing / spread[:, None, None]
+        cov = state.cov - gain @ pointing.mT
+        likelihood = -0.5 * (spread.log() + innovation.square() / spread + math.log(2 * math.pi))
+        return GaussianState(state.mean + gain[..., 0] * innovation[:, None], 0.5 * (cov + cov.mT)), likelihood
 
     def filter(
         self, model: StateModel, actuation: GaussianState, rows: Rows, columns: tuple[str, ...]
@@ -312,58 +330,25 @@ def _where(on: Tensor, state: GaussianState, other: GaussianState) -> GaussianSt
 class JointEKF(JointKalman):
     """One tangent a row: cheap, and overconfident where the belief is wide against the model's curvature."""
 
-    def predict(self, model: StateModel, state: GaussianState, row: Observation) -> GaussianState:
-        slope = model.slope(state.mean, row)
-        cov = slope @ state.cov @ slope.mT + model.noise(state.mean, row)
-        return GaussianState(model.advance(state.mean, row), cov)
-
-    def correct(
-        self, model: StateModel, state: GaussianState, row: Observation, channel: int
-    ) -> tuple[GaussianState, Float[Tensor, " vehicle"]]:
-        slope = model.observed_slope(state.mean, row, channel)
-        pointing = (state.cov @ slope.unsqueeze(-1)).squeeze(-1)
-        spread = (pointing * slope).sum(-1) + model.variance[:, channel]
-        innovation = row.measured[:, channel] - model.observe(state.mean, row, channel)
-        return gained(state, innovation, pointing, spread)
+    def through(
+        self, function: Callable[[Tensor], Tensor], slope: Callable[[Tensor], Tensor], state: GaussianState
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        tangent = slope(state.mean)
+        across = state.cov @ tangent.mT
+        return function(state.mean), tangent @ across, across
 
 
 class JointUKF(JointKalman):
     """Second order in the mean and no derivatives, at ``2d`` runs of the model a row."""
 
-    def predict(self, model: StateModel, state: GaussianState, row: Observation) -> GaussianState:
-        points = model.advance(sigma_points(state), row)
-        mean = points.mean(0)
-        centred = points - mean
-        cov = torch.einsum("pvi,pvj->vij", centred, centred) / len(points) + model.noise(state.mean, row)
-        return GaussianState(mean, cov)
-
-    def correct(
-        self, model: StateModel, state: GaussianState, row: Observation, channel: int
-    ) -> tuple[GaussianState, Float[Tensor, " vehicle"]]:
+    def through(
+        self, function: Callable[[Tensor], Tensor], slope: Callable[[Tensor], Tensor], state: GaussianState
+    ) -> tuple[Tensor, Tensor, Tensor]:
         points = sigma_points(state)
-        seen = model.observe(points, row, channel)
-        expected = seen.mean(0)
-        off = seen - expected
-        pointing = ((points - state.mean) * off.unsqueeze(-1)).mean(0)
-        spread = off.square().mean(0) + model.variance[:, channel]
-        return gained(state, row.measured[:, channel] - expected, pointing, spread)
-
-
-def gained(
-    state: GaussianState,
-    innovation: Float[Tensor, " vehicle"],
-    pointing: Float[Tensor, "vehicle d"],
-    spread: Float[Tensor, " vehicle"],
-) -> tuple[GaussianState, Float[Tensor, " vehicle"]]:
-    """The linear update: ``pointing`` ``(vehicle, d)`` is the covariance of state and reading, ``spread`` its variance.
-
-    Returns the state and the log likelihood of the reading, ``(vehicle,)``.
-    """
-    gain = pointing / spread.unsqueeze(-1)
-    mean = state.mean + gain * innovation.unsqueeze(-1)
-    cov = state.cov - gain.unsqueeze(-1) * pointing.unsqueeze(-2)
-    likelihood = -0.5 * (spread.log() + innovation.square() / spread + math.log(2 * math.pi))
-    return GaussianState(mean, 0.5 * (cov + cov.mT)), likelihood
+        values = function(points)
+        mean, count = values.mean(0), len(points)
+        off, away = (values - mean).movedim(0, -1), (points - state.mean).movedim(0, -1)
+        return mean, off @ off.mT / count, away @ off.mT / count
 
 
 def sigma_points(state: GaussianState) -> Float[Tensor, "point vehicle d"]:

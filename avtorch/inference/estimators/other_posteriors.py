@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avtorch.inference.belief import Summary
 from avtorch.inference.density import Density, SelectableDensity
-from avtorch.inference.importance import ImportanceSettings, WeightedDraws, approximated, weighted_draws
+from avtorch.inference.importance import ImportanceSettings, WeightedDraws, weighted_draws
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.sequential import SequentialInference
 
@@ -67,7 +67,7 @@ class ImportanceSampling(SequentialInference):
 
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
         # proposals need no better mode: it is within a hundredth of an SD
-        mode = find_mode(approximated(density), from_values=True, tolerance=5e-5)
+        mode = find_mode(density, from_values=True, tolerance=5e-5)
         found = self._drawn(density, mode, FIRST)
         for attempt in (partial(self._drawn, settings=WIDER), partial(self._drawn, settings=MANY), self._chains):
             again = (~found.converged).nonzero().squeeze(-1)
