@@ -1,8 +1,14 @@
 """The cars of a fleet beside one another: partially pooled T_L and K_L, and how large a cause is.
 
-Each quantity is pooled by itself, in a coordinate in which cars vary normally: the logarithm of a lag or gain, or that
-of the prior of an effect's parameter, in which typical sizes have a standard deviation of one. Parameters that belong
-to the drive (a road, the row at which a gain changes) are no car's and are left out.
+A drive's estimate varies about its car's by its own standard deviation and from drive to drive; cars vary about their
+model's mean (Gelman et al., Bayesian Data Analysis, chapter 5):
+
+    y_drive ~ Normal(car, sd_drive² + within²),    car ~ Normal(mean, between²)
+
+with priors Normal(0, 2²) of the mean and Gamma(2, 2 / spread) of the spreads. Each quantity is pooled by itself, in a
+coordinate in which cars vary normally: the logarithm of a lag or gain, or that of the prior of an effect's parameter,
+in which typical sizes have a standard deviation of one. Parameters that belong to the drive (a road, the row at which a
+gain changes) are no car's and are left out.
 """
 
 from __future__ import annotations
@@ -21,7 +27,13 @@ from torch.nn.functional import pad
 from avtorch.fleet.folder import LEAST_SD, QUANTITIES, Drive
 from avtorch.gap import EFFECTS
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.inference.population import MEAN_SD, SPREAD, PopulationMargin
+
+MEAN_SD = 2.0
+"""Prior standard deviation of the mean of a logarithm, about 0: a lag within a factor of 50 about a second."""
+
+SPREAD = 0.2
+"""Prior mean of the spreads, whose prior is Gamma(2, 2 / mean): lags of a model's cars differ by a fifth or so, and not
+by nothing."""
 
 FEWEST = 3
 """Cars from which there are siblings to compare with."""
@@ -45,46 +57,57 @@ _POINTS = 2001  # of a distribution function, of which quantiles are read
 
 
 class Pooled:
-    """One quantity of `cars`, each with one drive or more, by the density `margin` of its mean and spreads.
+    """One quantity of cars by the estimates `values` (drive,) of its logarithm, their standard deviations `sd` (drive,)
+    and the number `car` (drive,) of each drive's car, from 0 without a gap; `spread`: what cars are expected to differ
+    by.
 
     The mean over cars has a normal belief in closed form once the spreads are given, and so has each car. The belief in
     the spreads is the `weight` (between, within, left out) of each point of a grid: without each car in turn, and last
-    without none. A car that counted among those that tell the spread would widen it and so hide itself.
+    without none. A car that counted among those that tell the spread would widen it and so hide itself. Where no car
+    has two drives, the spread between these is part of that between cars.
     """
 
-    def __init__(self, margin: PopulationMargin) -> None:
-        self.margin = margin
+    def __init__(self, values: Tensor, sd: Tensor, car: Tensor, spread: float = SPREAD) -> None:
+        self.values, self.sd, self.car, self.spread = values, sd, car, spread
+        self.repeated = int(car.max()) + 1 < len(car)
         self.between, self.within = (torch.linspace(*WIDEST, n, dtype=torch.float64) for n in GRID)
-        if not margin.repeated:
+        if not self.repeated:
             self.within = torch.full((1,), -math.inf, dtype=torch.float64)
         self._weigh()
         for _ in range(NARROWINGS):
             self.between = _narrowed(self.between, self.weight.sum(1))
-            if margin.repeated:
+            if self.repeated:
                 self.within = _narrowed(self.within, self.weight.sum(0))
             self._weigh()
 
     def _weigh(self) -> None:
         """Belief in each point, and what each tells of the mean over cars: `centre`, `precision`."""
-        self.own, self.own_precision, left = (x[:, 0] for x in self.margin.of_cars(self.within.exp()[:, None]))
+        # what the drives of each car say together (within, car), and what is left of their density
+        v = self.sd.square() + self.within.exp().square()[:, None]
+        self.own_precision = self._summed(1 / v)
+        self.own = self._summed(self.values / v) / self.own_precision
+        left = self._summed(v.log() + (self.values - self.own[:, self.car]).square() / v) + self.own_precision.log()
         self.variance = self.between.exp().square()[:, None, None] + 1 / self.own_precision
         w = 1 / self.variance
         # sums over all cars, less the one left out; the prior of the mean counts as one more, of mean 0
         total, weighted, square, logs = (
-            x.sum(-1, keepdim=True) - pad(x, (0, 1))
-            for x in (w, w * self.own, w * self.own.square(), w.log() + 2 * left)
+            x.sum(-1, keepdim=True) - pad(x, (0, 1)) for x in (w, w * self.own, w * self.own.square(), w.log() - left)
         )
         self.precision = total + 1 / MEAN_SD**2
         self.centre = weighted / self.precision
         log_weight = 0.5 * (logs - self.precision.log() - square + weighted * self.centre)
         log_weight = log_weight + self._log_prior(self.between)[:, None, None]
-        if self.margin.repeated:
+        if self.repeated:
             log_weight = log_weight + self._log_prior(self.within)[:, None]
         self.weight = log_weight.flatten(0, 1).softmax(0).unflatten(0, log_weight.shape[:2])
 
+    def _summed(self, x: Tensor) -> Tensor:
+        """(within, car) of what drives (within, drive) have."""
+        return x.new_zeros(len(x), int(self.car.max()) + 1).index_add(-1, self.car, x)
+
     def _log_prior(self, spread: Tensor) -> Tensor:
         """Gamma(2, 2 / mean) of a spread, in its logarithm."""
-        return 2 * spread - 2 / self.margin.spread * spread.exp()
+        return 2 * spread - 2 / self.spread * spread.exp()
 
     def siblings(self) -> tuple[Tensor, Tensor]:
         """Of each car (car,) what its siblings predict, and the two-sided tail of its own drives under that."""
@@ -121,7 +144,7 @@ class Pooled:
     def spreads(self) -> dict[str, Any]:
         """How far cars differ, and how far drives of one car do (None where no car has two)."""
         weight = self.weight[..., -1]
-        within = _spread(self.within, weight.sum(0)) if self.margin.repeated else None
+        within = _spread(self.within, weight.sum(0)) if self.repeated else None
         return {"between": _spread(self.between, weight.sum(1)), "within": within, "converged": True, "why": ""}
 
 
@@ -150,7 +173,7 @@ def pooled(cars: Mapping[str, Sequence[Drive]], quantity: str, spread: float = S
     """A quantity of cars, all of which have drives; `spread`: what cars are expected to differ by."""
     told = [(number, *drive[quantity]) for number, drives in enumerate(cars.values()) for drive in drives]
     number, values, sd = torch.tensor(told, dtype=torch.float64).T
-    return Pooled(PopulationMargin(values[None], sd[None], number.long(), spread=spread))
+    return Pooled(values, sd, number.long(), spread)
 
 
 def _each_car(

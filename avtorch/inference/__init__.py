@@ -21,7 +21,6 @@ from avtorch.inference.density import (
 from avtorch.inference.form import ExcitationRule, Form, JerkForm, WindowLikelihood
 from avtorch.inference.jerk import JerkDensity, JerkPoints, JerkStatistics, jerk_log_likelihood
 from avtorch.inference.map import Mode, find_mode
-from avtorch.inference.population import PopulationMargin
 from avtorch.inference.posterior import Posterior, nested_rhat
 from avtorch.inference.quadrature import Quadrature, integrate
 from avtorch.inference.sampler import sample
@@ -43,7 +42,6 @@ __all__ = [
     "JerkPoints",
     "JerkStatistics",
     "Mode",
-    "PopulationMargin",
     "Posterior",
     "Quadrature",
     "SamplerSettings",
