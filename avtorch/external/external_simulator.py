@@ -18,7 +18,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
-from scipy.integrate import trapezoid
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
@@ -26,6 +25,7 @@ from avtorch.external.adjusting import Adjusted, Rollouts, adjusted, fewest_roll
 from avtorch.external.driving import aligned, driven_along, in_drives, side_by_side
 from avtorch.external.simulator import Limits, Simulator, Values, check_methods, values_of, with_values
 from avtorch.external.surrogate import Surrogate, surrogate_of
+from avtorch.gap.linearised import linearised
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.simulator_under_test import SAME_KIND, ParameterDifference, SimulatorUnderTest
@@ -262,32 +262,12 @@ def without_discrepancy(log: Log, simulated: Log, surrogate: GapPlant) -> Log:
     return replace(log, **{name: shared.get(name) for name in channels})
 
 
-_STEP_MPS2, _RATE_HZ = 0.5, 100
-_BEFORE_S, _AFTER_S, _SETTLED_S = 1.0, 9.0, 1.0
-
-
 def lateness(plant: GapPlant, speed: float) -> float:
-    """Mean delay [s] of the acceleration that answers a step in the command, at a speed [m/s].
-
-    It is the area between the step and its answer, over the answer's height: `T_L` for GLVD, and the sum of the delays
-    of all that the command passes. At least `T_L`, also for a plant that does not answer a step of 0.5 m/s².
-    """
-    time = np.arange(round((_BEFORE_S + _AFTER_S) * _RATE_HZ)) / _RATE_HZ
-    step = np.where(time < _BEFORE_S, 0.0, _STEP_MPS2)
-    still = 0.0 * time
-
-    def accel(command: FloatArray) -> FloatArray:
-        drive = Log.from_arrays(time=time, accel_cmd=command, accel=still, speed=still + max(speed, 1.0))
-        return responses(drive, plant)["accel"]
-
-    # without the forces that act whatever the command
-    answer = accel(step) - accel(still)
-    height = float(answer[-round(_SETTLED_S * _RATE_HZ) :].mean())
-    least = float(plant.T_L)
-    if abs(height) < 1e-3 * _STEP_MPS2:
-        return least
-    after = time >= _BEFORE_S
-    return max(float(trapezoid(1.0 - answer[after] / height, dx=1 / _RATE_HZ)), least)
+    """Delay [s] of the measured acceleration behind slow commands, at a speed [m/s]: `T_L` for GLVD, and the sum of the
+    delays of all that the command passes. At least `T_L`, also for a plant that does not answer a step of 0.5 m/s²."""
+    chain = linearised(plant, speed=max(speed, 1.0))
+    answer = chain.motion[0, 0] * chain.sensed[0, 0]
+    return max(-float(answer.angle()) / float(chain.omega[0]), float(plant.T_L))
 
 
 HORIZON_S = 10.0
