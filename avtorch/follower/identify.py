@@ -219,7 +219,7 @@ def identified(candidate: Followed, *, start: Identified | None = None) -> Ident
     cost = {tuple(x): value for x, value in (_mode(candidate, start) for start in starts)}
     best = np.array(min(cost, key=lambda x: cost[x]))
     n = candidate.size
-    covariance = np.linalg.inv(_expansion(candidate, best)[1])[:n, :n]
+    covariance = np.asarray(np.linalg.inv(_expansion(candidate, best)[1]), np.float64)[:n, :n]
     return Identified(candidate, best[:n], best[n:], covariance)
 
 

@@ -167,7 +167,7 @@ def _text(made: PedalMap) -> str:
         for x, accels, errors in zip(table.pedal.tolist(), table.accel.tolist(), sd.tolist(), strict=True):
             for v, a, e in zip(made.speed.tolist(), accels, errors, strict=True):
                 lines.append(f"{name},{x!r},{v!r},{a!r},{e!r}")
-    more = {"lag": (made.T_L, 0), "delay": (made.dead_time, 0)}
+    more = {"lag": (made.T_L, 0.0), "delay": (made.dead_time, 0.0)}
     if made.driven is not None:
         more["driven"] = made.driven
     lines += [f"{name},{float(value):.9g},{speed:.9g},0,0" for name, (value, speed) in more.items()]
