@@ -43,24 +43,6 @@ NEEDED = ("speed", "spacing", "lead_speed")
 _WIDER = 2.0  # a delay can be far shorter than is typical, down to none
 
 
-@dataclass(frozen=True)
-class Coordinate:
-    """One coordinate of a fit, standard normal a priori: the parameter's key, and by how much its prior is widened."""
-
-    key: str
-    parameter: Parameter
-    wider: float = 1.0
-
-    def value(self, z: FloatArray) -> Tensor:
-        """The parameter at `z`, in its shape."""
-        return self.parameter.constrain(torch.as_tensor(self.wider * z))
-
-    def z_of(self, value: float) -> float:
-        """The coordinate of a value, at most four standard deviations from the prior's centre."""
-        z = float(self.parameter.unconstrain(torch.tensor(value, dtype=torch.float64))) / self.wider
-        return float(np.clip(z, -4.0, 4.0))
-
-
 @dataclass(frozen=True, eq=False)
 class Followed:
     """`law`, and a plant with a dead time or without, over the speed of a log; `data`: the log in coefficients.
@@ -75,11 +57,11 @@ class Followed:
     seen: tuple[FollowerMeasurements, ...] = field(repr=False)
 
     @cached_property
-    def coordinates(self) -> tuple[Coordinate, ...]:
-        """The law's parameters by `law.parameter`, `T_L` [s], and the dead time [s]."""
-        law = [Coordinate(f"law.{p.name}", p) for p in self.law.parameters]
-        car = [(key, p) for key, p in self.plant.parameters().items() if key != "K_L"]
-        return (*law, *(Coordinate(key, p, 1.0 if key == "T_L" else _WIDER) for key, p in car))
+    def coordinates(self) -> dict[str, Parameter]:
+        """The law's parameters by `law.parameter`, `T_L` [s], and the dead time [s]; standard normal a priori."""
+        law = {f"law.{p.name}": p for p in self.law.parameters}
+        car = {key: p if key == "T_L" else _widened(p) for key, p in self.plant.parameters().items() if key != "K_L"}
+        return law | car
 
     @property
     def size(self) -> int:
@@ -92,11 +74,13 @@ class Followed:
 
     def values(self, z: FloatArray) -> dict[str, Tensor]:
         """Values (column,) by key, for `z` (column, coordinate)."""
-        return {c.key: c.value(z[:, i]) for i, c in enumerate(self.coordinates)}
+        return {key: p.constrain(torch.as_tensor(z[:, i])) for i, (key, p) in enumerate(self.coordinates.items())}
 
     def z_of(self, values: Mapping[str, float]) -> FloatArray:
-        """Coordinates (coordinate,) for values by key; missing ones are at their prior's centre."""
-        return np.array([c.z_of(values[c.key]) if c.key in values else 0.0 for c in self.coordinates])
+        """Coordinates (coordinate,) for values by key, at most four standard deviations from their priors' centres,
+        where missing ones are."""
+        there = [(p, values.get(key, float(p.typical()))) for key, p in self.coordinates.items()]
+        return np.clip([float(p.unconstrain(torch.tensor(x, dtype=torch.float64))) for p, x in there], -4.0, 4.0)
 
     def residual(self, z: FloatArray) -> FloatArray:
         """Measured less simulated coefficients of the differenced speed, (column, frame, bin)."""
@@ -141,6 +125,12 @@ def car_of(values: Mapping[str, float]) -> GapPlant:
     """The plant with lag and delay as found, `K_L` 1."""
     kind, delay = delay_effect(), values.get(delay_key())
     return plant([] if delay is None else [kind.of({str(kind.shift): delay})], T_L=values["T_L"], K_L=1.0)
+
+
+def _widened(p: Parameter) -> Parameter:
+    """The parameter with a prior of more standard deviations."""
+    low, high = p.constrain(_WIDER * p.unconstrain(torch.tensor([p.low, p.high], dtype=torch.float64))).tolist()
+    return replace(p, low=low, high=high)
 
 
 def _over(log: Log, law: HeadwayLaw, car: GapPlant) -> Followed:
@@ -293,6 +283,5 @@ def _expansion(own: Followed, x: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _starts(candidate: Followed) -> list[FloatArray]:
     noise = np.zeros(len(_PRIORS))
-    if delay_key() not in [c.key for c in candidate.coordinates]:
-        return [np.append(np.zeros(candidate.size), noise)]
-    return [np.append(candidate.z_of({delay_key(): delay}), noise) for delay in _DELAYS_S]
+    delays = _DELAYS_S if delay_key() in candidate.coordinates else _DELAYS_S[:1]
+    return [np.append(candidate.z_of({delay_key(): delay}), noise) for delay in delays]
