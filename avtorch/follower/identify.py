@@ -194,6 +194,11 @@ class Identified:
         """Parameters at the mode, by key: `law.*`, `T_L` [s], `dead_time.delay_s` [s]."""
         return {k: float(v[0]) for k, v in self.candidate.values(self.z[None]).items()}
 
+    @property
+    def noise(self) -> FloatArray:
+        """Variance (bin,) of the differenced speed's coefficients [(m/s²)²]."""
+        return np.exp(_log_variance(self.candidate.data, self.values["T_L"], self.w))
+
     def draws(self, covariance: FloatArray, *, seed: int = 0) -> dict[str, FloatArray]:
         """Parameters (draw,) of a normal posterior in `z` with this covariance."""
         noise = np.random.default_rng(seed).standard_normal((_DRAWS, len(self.z)))
