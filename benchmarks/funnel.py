@@ -21,11 +21,15 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
+from torch import Tensor
+from torch.distributions import Gamma, Normal
+from torch.distributions.constraints import positive, real
 
 from avtorch.arrays import FloatArray
-from avtorch.inference import PopulationMargin, sample
+from avtorch.fleet.population import MEAN_SD, SPREAD
+from avtorch.inference import sample
 from avtorch.inference.chains import effective_sample_size
-from avtorch.inference.population import MEAN_SD, SPREAD
+from benchmarks.torch_density import TorchDensity
 
 F64 = torch.float64
 BETWEEN = 0.05  # of the truth
@@ -42,12 +46,25 @@ def fleet(cars: int, sd: float, seed: int) -> tuple[FloatArray, FloatArray]:
     return -1.0 + BETWEEN * rng.standard_normal(cars) + sds * rng.standard_normal(cars), sds
 
 
-def by_grid(margin: PopulationMargin) -> tuple[FloatArray, FloatArray]:
+def margin(y: FloatArray, sd: FloatArray) -> TorchDensity:
+    """The density of mean and `between` with the cars integrated out."""
+    values, errors = torch.as_tensor(y), torch.as_tensor(sd)
+
+    def log_density(p: dict[str, Tensor]) -> Tensor:
+        spread = (p["between"][..., None].square() + errors.square()).sqrt()
+        prior = Normal(0.0, MEAN_SD).log_prob(p["mean"]) + Gamma(2.0, 2 / SPREAD).log_prob(p["between"])
+        return prior + Normal(p["mean"][..., None], spread).log_prob(values).sum(-1)
+
+    begin = {"mean": float(y.mean()), "between": max(float(y.std()), 0.02)}
+    return TorchDensity(log_density, {"mean": real, "between": positive}, start=begin)
+
+
+def by_grid(density: TorchDensity) -> tuple[FloatArray, FloatArray]:
     """Mean and standard deviation of (mean, log between)."""
     mean = torch.linspace(-3.0, 1.0, 1201, dtype=F64)
     log_between = torch.linspace(-14.0, 2.0, 1601, dtype=F64)
     z = torch.stack(torch.meshgrid(mean, log_between, indexing="ij"), -1)
-    p = torch.stack([margin.log_prob(row[:, None])[:, 0] for row in z])
+    p = torch.stack([density.log_prob(row[:, None])[:, 0] for row in z])
     p = (p - p.max()).exp()
     p /= p.sum()
     centre = (p[..., None] * z).sum((0, 1))
@@ -55,8 +72,7 @@ def by_grid(margin: PopulationMargin) -> tuple[FloatArray, FloatArray]:
 
 
 def by_sgld(y: FloatArray, sd: FloatArray, seed: int) -> FloatArray:
-    margin = PopulationMargin(*(torch.as_tensor(x)[None] for x in (y, sd)), torch.arange(len(y)))
-    found = sample(margin, generator=torch.Generator().manual_seed(seed)).draws[:, :, 0].numpy()
+    found = sample(margin(y, sd), generator=torch.Generator().manual_seed(seed)).draws[:, :, 0].numpy()
     return np.stack([found[..., 0], np.log(found[..., 1])], -1).swapaxes(0, 1)
 
 
@@ -142,7 +158,7 @@ def _effective(values: FloatArray) -> float:
 def rows(cars: int, sd: float, seed: int) -> Iterator[str]:
     """A line a sampler."""
     y, sds = fleet(cars, sd, seed)
-    exact, spread = by_grid(PopulationMargin(*(torch.as_tensor(x)[None] for x in (y, sds)), torch.arange(cars)))
+    exact, spread = by_grid(margin(y, sds))
     for name, draw in SAMPLERS.items():
         began = time.process_time()
         try:

@@ -27,7 +27,7 @@ def held(cars: int, spread: float, seed: int) -> float:
     g = torch.Generator().manual_seed(seed)
     mean, *noise = torch.randn(1 + 2 * cars, generator=g, dtype=torch.float64).tolist()
     told = {str(i): [{CAUSE: {NAME: (mean + spread * noise[i] + TOLD * noise[cars + i], TOLD)}}] for i in range(cars)}
-    found = effect_sizes(CAUSE, told, seed)[0][NAME]["next_car"]
+    found = effect_sizes(CAUSE, told)[0][NAME]["next_car"]
     ends = parameter.unconstrain(torch.tensor([found["q05"], found["q95"]], dtype=torch.float64))
     low, high = ndtr((ends - mean) / spread).tolist()
     return abs(high - low)

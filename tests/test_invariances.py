@@ -293,7 +293,7 @@ def test_no_computation_reads_the_recorders_clock() -> None:
     shown = {
         "decision/estimation.py",
         "gap/engine/drive_data.py", "io/quality.py",
-        "live/played_log.py", "validation/windows.py",
+        "live/source.py", "validation/windows.py",
     }  # fmt: skip
     package = Path(avtorch.__file__).parent
     found = {

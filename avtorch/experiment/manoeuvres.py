@@ -8,13 +8,13 @@ a limited jerk; holds show whatever depends on speed; a sweep of frequencies sho
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from scipy.signal import chirp
 
-from avtorch.arrays import FloatArray, IntArray
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.result.log_facts import LogFacts
 
@@ -192,10 +192,14 @@ def _all(limits: Limits, rate_hz: float) -> Iterator[Manoeuvre]:
         for size in (0.25 * both, both):
             for hold in (2.0, 5.0):
                 name = f"steps of {size:.2g} m/s² held {hold:g} s {at}"
-                yield from made(name, v, lambda t, a=size, h=hold: _steps(t, a, h), 4 * hold)
-        period = 3 * gain * (1 / push + 1 / brake) + 2.0
+                # every level alternates with rest, and each sign comes first once
+                levels = size * np.array([1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0, 0.0])
+                yield from made(name, v, _stages(levels, [hold] * 8), 4 * hold)
         name = f"pedals to {push:.2g} and {-brake:.2g} m/s² {at}"
-        yield from made(name, v, lambda t: _pedals(t, push, brake, gain), period)
+        # one in full after the other, then half of each, for as long as restores the speed
+        on, off = gain / push, gain / brake
+        lasts = [on, off, 1.0, 2 * off, 2 * on, 1.0]
+        yield from made(name, v, _stages([push, -brake, 0.0, -0.5 * brake, 0.5 * push, 0.0], lasts), sum(lasts))
         yield from made(f"sweep of {swept:.2g} m/s², 0.05 to 2 Hz, {at}", v, lambda t: _sweep(t, swept))
         yield from made(f"small reversals {at}", v, lambda t: _reversals(t, whole), 6.0)
         for slope in (0.4, 1.5):
@@ -208,10 +212,14 @@ def _all(limits: Limits, rate_hz: float) -> Iterator[Manoeuvre]:
             rest = whole / 6 - each
             if rest >= _SHORTEST_HOLD_S:
                 name = f"holds at speeds from {low + step:.{digits}f} to {v:.{digits}f} m/s, {size:.2g} m/s² between"
-                yield from made(name, low + step, lambda t, a=size, e=each, r=rest: _holds(t, a, e, r))
+                # up in three stages and down in three
+                pattern = _stages([size, 0.0] * 3 + [-size, 0.0] * 3, [each, rest] * 6)
+                yield from made(name, low + step, pattern)
     for size in (0.5 * both, both):
-        name = f"slow and go, {size:.2g} m/s²"
-        yield from made(name, low + 0.5 * step, lambda t, a=size: _slow_and_go(t, a, gain), 2 * gain * 2 / size + 5.0)
+        # from walking pace up and back, and some seconds of rolling
+        each = 2 * gain / size
+        pattern = _stages([size, 0.0, -size, 0.0], [each, 1.0, each, 4.0])
+        yield from made(f"slow and go, {size:.2g} m/s²", low + 0.5 * step, pattern, 2 * each + 5.0)
 
 
 def _made(name: str, time: FloatArray, start: float, pattern: Pattern, lasts: float) -> Manoeuvre:
@@ -224,17 +232,10 @@ def _made(name: str, time: FloatArray, start: float, pattern: Pattern, lasts: fl
     return made.trimmed(-float(u.sum() * dt), start)
 
 
-def _steps(t: FloatArray, size: float, hold: float) -> FloatArray:
-    """+, 0, -, 0, -, 0, +, 0: every level alternates with rest, and each sign comes first once."""
-    return size * np.array([1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0, 0.0])[(t / hold + 1e-9).astype(int) % 8]
-
-
-def _pedals(t: FloatArray, push: float, brake: float, gain: float) -> FloatArray:
-    """One pedal in full after the other, then half of each, for as long as restores the speed."""
-    on, off = gain / push, gain / brake
-    ends = np.cumsum([on, off, 1.0, 2 * off, 2 * on, 1.0])
-    levels = np.array([push, -brake, 0.0, -0.5 * brake, 0.5 * push, 0.0])
-    return levels[_stage(t, ends)]
+def _stages(levels: Sequence[float] | FloatArray, lasts: Sequence[float]) -> Pattern:
+    """Commands [m/s²] one after the other, each for as long as it lasts [s], repeating."""
+    ends, held = np.cumsum(lasts), np.asarray(levels, dtype=float)
+    return lambda t: held[np.searchsorted(ends, t % ends[-1] + 1e-9, side="right").clip(0, len(ends) - 1)]
 
 
 def _sweep(t: FloatArray, size: float) -> FloatArray:
@@ -251,19 +252,3 @@ def _reversals(t: FloatArray, whole: float) -> FloatArray:
 def _ramps(t: FloatArray, slope: float, top: float) -> FloatArray:
     phase = (t * slope / (4 * top)) % 1.0
     return 4 * top * np.where(phase < 0.25, phase, np.where(phase < 0.75, 0.5 - phase, phase - 1.0))
-
-
-def _holds(t: FloatArray, size: float, each: float, rest: float) -> FloatArray:
-    """Up in three stages and down in three, without a command between."""
-    return np.array([size, 0.0] * 3 + [-size, 0.0] * 3)[_stage(t, np.cumsum([each, rest] * 6))]
-
-
-def _slow_and_go(t: FloatArray, size: float, gain: float) -> FloatArray:
-    """From walking pace up and back, and some seconds of rolling."""
-    each = 2 * gain / size
-    return np.array([size, 0.0, -size, 0.0])[_stage(t, np.cumsum([each, 1.0, each, 4.0]))]
-
-
-def _stage(t: FloatArray, ends: FloatArray) -> IntArray:
-    """Number of the stage at each moment, repeating."""
-    return np.searchsorted(ends, t % ends[-1] + 1e-9, side="right").clip(0, len(ends) - 1)

@@ -16,13 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import lsq_linear
 from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
-from avtorch.arrays import BoolArray, FloatArray
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed
 from avtorch.external.simulator import Limits, Values
 from avtorch.gap.engine.compiled_plant import read_late
@@ -40,166 +40,124 @@ _STEP_S = 0.004  # of a difference in a recorder's delay or filter
 _STOP_NATS = 0.02
 
 
-@dataclass(frozen=True, eq=False)
-class LinearResponse:
-    """What `data` would show of the simulator: readings `center` (channel, row) of acceleration [m/s²] and speed [m/s]
-    at the parameters `at` (parameter,), and `slopes` (parameter, channel, row) by them.
+class _Place(NamedTuple):
+    """The unknowns `x` (size,), what is `left` (channel, frame, bin), its log likelihood [nats], and the noise's
+    `covariance` (band, channel, channel)."""
 
-    The vector x holds the parameters z within `limits` (parameter, 2), in prior standard deviations from where they
+    x: FloatArray
+    left: FloatArray
+    log_likelihood: float
+    covariance: FloatArray
+
+
+class LinearFit:
+    """The simulator's readings `center` (channel, row) of acceleration [m/s²] and speed [m/s] at the parameters `at`
+    (parameter,) and their `slopes` (parameter, channel, row), fitted to `data` behind a recorder.
+
+    The unknowns x hold the parameters z from `low` to `high` (parameter,), in prior standard deviations from where they
     were, then delay and filter [s] of each channel.
     """
 
-    data: DriveData
-    center: FloatArray
-    slopes: FloatArray
-    at: FloatArray
-    limits: FloatArray
-
-    @property
-    def recorder(self) -> list[str]:
-        return [f"{channel}_{what}" for channel in self.data.channels for what in ("delay", "filter")]
-
-    @cached_property
-    def prior(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and standard deviation (size,)."""
-        own = [normal_prior(name, 0.0) for name in self.recorder]
-        mean, sd = np.array([*[(0.0, 1.0)] * len(self.at), *own]).T
-        return mean, np.where(self._late, np.hypot(sd, 0.5 * self.data.dt), sd)
-
-    @cached_property
-    def ends(self) -> tuple[FloatArray, FloatArray]:
-        """Least and greatest x."""
-        plain = Hypothesis(self.data)
-        low, high = np.concatenate([self.limits.reshape(-1, 2), [plain.limits(name) for name in self.recorder]]).T
-        return np.where(self._late, np.minimum(low, -self.data.dt), low), high
-
-    @property
-    def _late(self) -> BoolArray:
-        """Which of x are delays. The car's command moves between rows, where the simulator's is held, so that each
-        channel may lead by a part of a row."""
-        return np.array([False] * len(self.at) + [name.endswith("_delay") for name in self.recorder])
-
-    def readings(self, z: FloatArray) -> FloatArray:
-        """Of the simulator, (channel, row)."""
-        return self.center + np.tensordot(z - self.at, self.slopes, 1)
-
-    def recorded(self, readings: FloatArray, recorder: FloatArray) -> FloatArray:
-        """Coefficients (channel, frame, bin) of readings (channel, row) behind a recorder."""
-        shown: dict[str, FloatArray | None] = {"accel": None, "speed": None}
-        for channel, x, (delay, filter_s) in zip(self.data.channels, readings, recorder.reshape(-1, 2), strict=True):
-            late = np.empty_like(x)
-            read_late(self.data.time, self.data.time, np.ascontiguousarray(x), delay, late)
-            shown[channel] = self.data.low_pass(late, filter_s)
-        speed = shown["speed"]
-        return self.data.transform(
-            self.data.channel_rows(shown["accel"], None if speed is None else self.data.held(speed))
-        )
-
-    def response(self, x: FloatArray) -> FloatArray:
-        """Coefficients (channel, frame, bin) at x (size,)."""
-        n = len(self.at)
-        return self.recorded(self.readings(x[:n]), x[n:])
-
-    def jacobian(self, x: FloatArray) -> FloatArray:
-        """Derivatives (size, channel, frame, bin)."""
-        n = len(self.at)
-        out = [self.recorded(slope, x[n:]) for slope in self.slopes]
-        for i in range(n, len(x)):
-            step = np.where(np.arange(len(x)) == i, _STEP_S, 0.0)
-            below = x - step if x[i] - _STEP_S >= self.ends[0][i] else x
-            out.append((self.response(x + step) - self.response(below)) / (x[i] + _STEP_S - below[i]))
-        return np.array(out)
-
-
-@dataclass(frozen=True, eq=False)
-class LinearFit:
-    """A `model` at its best `x` (size,), with the noise's `covariance` (band, channel, channel) there."""
-
-    model: LinearResponse
-    x: FloatArray
-    residual: FloatArray = field(repr=False)
-    log_likelihood: float
-    covariance: FloatArray = field(repr=False)
-
-    @classmethod
-    def at(cls, model: LinearResponse, x: FloatArray) -> LinearFit:
-        residual = model.data.measured - model.response(x)
-        return cls(model, x, residual, *log_likelihood(model.data, residual))
-
-    @classmethod
-    def of(cls, model: LinearResponse) -> LinearFit:
-        """By Gauss-Newton, from where the simulator stands."""
-        mean, sd = model.prior
-        fit = cls.at(model, np.clip(np.concatenate([model.at, mean[len(model.at) :]]), *model.ends))
+    def __init__(
+        self, data: DriveData, center: FloatArray, slopes: FloatArray, at: FloatArray, low: FloatArray, high: FloatArray
+    ) -> None:
+        self.data, self.center, self.slopes, self.at = data, center, slopes, at
+        recorder = [f"{channel}_{what}" for channel in data.channels for what in ("delay", "filter")]
+        plain, none = Hypothesis(data), np.zeros(len(at))
+        mean, sd = np.array([normal_prior(name, 0.0) for name in recorder]).T
+        least, most = np.array([plain.limits(name) for name in recorder]).T
+        # the car's command moves between rows, where the simulator's is held: each channel may lead by a part of a row
+        sd[::2] = np.hypot(sd[::2], 0.5 * data.dt)
+        least[::2] = np.minimum(least[::2], -data.dt)
+        self.mean, self.sd = np.concatenate([none, mean]), np.concatenate([none + 1.0, sd])
+        self.low, self.high = np.concatenate([low, least]), np.concatenate([high, most])
+        self.best = self._place(np.concatenate([at, mean]))
         for _ in range(_ITERATIONS):
-            W = fit.whitened
-            root = np.linalg.cholesky(W @ W.T + np.diag(sd**-2.0))
-            downhill = W @ whiten(model.data, fit.covariance, fit.residual) + (mean - fit.x) / sd**2
-            low, high = (end - fit.x for end in model.ends)
-            step = lsq_linear(root.T, np.linalg.solve(root, downhill), (low - 1e-12, high + 1e-12), "bvls").x
-            tried = [cls.at(model, np.clip(fit.x + share * step, *model.ends)) for share in (1.0, 0.3, 0.1)]
-            best = max(tried, key=lambda f: f.objective)
-            gain = best.objective - fit.objective
-            if gain > 0:
-                fit = best
-            if gain < _STOP_NATS:
+            before, self.best = self.best, self._stepped()
+            if self._objective(self.best) - self._objective(before) < _STOP_NATS:
                 break
-        return fit
+        self.whitened = self._whitened(self.best)
+        self.information = self.whitened @ self.whitened.T + np.diag(self.sd**-2.0)
 
     @property
     def z(self) -> FloatArray:
         """The simulator's parameters (parameter,)."""
-        return self.x[: len(self.model.at)]
+        return self.best.x[: len(self.at)]
 
-    @property
-    def objective(self) -> float:
+    def _place(self, x: FloatArray) -> _Place:
+        x = np.clip(x, self.low, self.high)
+        left = self.data.measured - self._response(x)
+        return _Place(x, left, *log_likelihood(self.data, left))
+
+    def _objective(self, place: _Place) -> float:
         """Log likelihood and priors, without constants [nats]."""
-        mean, sd = self.model.prior
-        return self.log_likelihood - 0.5 * float((((self.x - mean) / sd) ** 2).sum())
+        return place.log_likelihood - 0.5 * float((((place.x - self.mean) / self.sd) ** 2).sum())
 
-    @cached_property
-    def whitened(self) -> FloatArray:
+    def _stepped(self) -> _Place:
+        """The place after a step of Gauss-Newton that gains, or the same one."""
+        now, W = self.best, self._whitened(self.best)
+        root = np.linalg.cholesky(W @ W.T + np.diag(self.sd**-2.0))
+        downhill = W @ whiten(self.data, now.covariance, now.left) + (self.mean - now.x) / self.sd**2
+        ends = self.low - now.x - 1e-12, self.high - now.x + 1e-12
+        step = lsq_linear(root.T, np.linalg.solve(root, downhill), ends, "bvls").x
+        return max([now, *(self._place(now.x + share * step) for share in (1.0, 0.3, 0.1))], key=self._objective)
+
+    def _response(self, x: FloatArray) -> FloatArray:
+        """Coefficients (channel, frame, bin)."""
+        n = len(self.at)
+        return self._recorded(self.center + np.tensordot(x[:n] - self.at, self.slopes, 1), x[n:])
+
+    def _recorded(self, readings: FloatArray, recorder: FloatArray) -> FloatArray:
+        """Coefficients (channel, frame, bin) of readings (channel, row) behind a recorder."""
+        data, shown = self.data, dict[str, FloatArray]()
+        for channel, x, (delay, filter_s) in zip(data.channels, readings, recorder.reshape(-1, 2), strict=True):
+            late = np.empty_like(x)
+            read_late(data.time, data.time, np.ascontiguousarray(x), delay, late)
+            shown[channel] = data.low_pass(late, filter_s)
+        speed = shown.get("speed")
+        return data.transform(data.channel_rows(shown.get("accel"), None if speed is None else data.held(speed)))
+
+    def _whitened(self, place: _Place) -> FloatArray:
         """Derivatives (size, coefficient) in units of the noise."""
-        slopes = self.model.jacobian(self.x)
-        return np.array([whiten(self.model.data, self.covariance, slope) for slope in slopes])
-
-    @cached_property
-    def information(self) -> FloatArray:
-        """(size, size), of likelihood and priors."""
-        return self.whitened @ self.whitened.T + np.diag(self.model.prior[1] ** -2.0)
+        x, n = place.x, len(self.at)
+        slopes = [self._recorded(slope, x[n:]) for slope in self.slopes]
+        for i in range(n, len(x)):
+            step = np.where(np.arange(len(x)) == i, _STEP_S, 0.0)
+            below = x - step if x[i] - _STEP_S >= self.low[i] else x
+            slopes.append((self._response(x + step) - self._response(below)) / (x[i] + _STEP_S - below[i]))
+        return np.array([whiten(self.data, place.covariance, slope) for slope in slopes])
 
     def evidence_over(self, other: LinearFit) -> float:
         """Logarithm of the Bayes factor of this model over another one of the same data [nats], by Laplace.
 
         What is gained below 10 Hz alone, or above alone, does not count: a closed loop echoes noise.
         """
-        data = self.model.data
-        low = claimed(data, self.covariance) - claimed(data, other.covariance)
-        return min(low, self.log_likelihood - other.log_likelihood) + self._volume - other._volume
+        low = claimed(self.data, self.best.covariance) - claimed(self.data, other.best.covariance)
+        gain = self.best.log_likelihood - other.best.log_likelihood
+        return min(low, gain) + self._volume - other._volume
 
     @property
     def _volume(self) -> float:
         """Of the posterior by that of the prior [nats]."""
-        mean, sd = self.model.prior
-        spread = np.linalg.slogdet(self.information * np.outer(sd, sd))[1]
-        return -0.5 * float(spread) - 0.5 * float((((self.x - mean) / sd) ** 2).sum())
+        spread = float(np.linalg.slogdet(self.information * np.outer(self.sd, self.sd))[1])
+        return -0.5 * spread - 0.5 * float((((self.best.x - self.mean) / self.sd) ** 2).sum())
 
     @property
     def errors(self) -> FloatArray:
         """Standard deviations (parameter,): the posterior's, or more where frames disagree by more (a sandwich;
         Huber 1967)."""
-        data, n, size = self.model.data, len(self.model.at), len(self.x)
-        residual = whiten(data, self.covariance, self.residual)
+        data, size = self.data, len(self.best.x)
+        residual = whiten(data, self.best.covariance, self.best.left)
         scores = (self.whitened * residual).reshape(size, data.channel_count, data.frame_count, -1).sum((1, 3))
         scores -= scores.mean(1, keepdims=True)
         inverse = np.linalg.inv(self.information)
         more = data.frame_count / max(data.frame_count - size, 1)
         sandwich = more * inverse @ scores @ scores.T @ inverse
-        return np.sqrt(np.maximum(np.diag(sandwich), np.diag(inverse)))[:n]
+        return np.sqrt(np.maximum(np.diag(sandwich), np.diag(inverse)))[: len(self.at)]
 
 
 _ROUNDS = 4  # of linearising
-_BESIDE = 0.02  # of a parameter's range: where the simulator is driven beside its value
+_BESIDE = 0.04  # prior standard deviations: where the simulator is driven beside a value
 _STAYS = 0.02  # prior standard deviations, a hundredth of the range
 _SURELY = 0.95  # of an interval that does not hold the present value
 
@@ -213,10 +171,6 @@ class Adjusted:
     outputs: tuple[Log, ...]
     parameters: tuple[ParameterDifference, ...]
     rollouts: Rollouts
-
-    @property
-    def wrong(self) -> bool:
-        return any(p.differs for p in self.parameters)
 
 
 @dataclass(eq=False)
@@ -271,20 +225,35 @@ def adjusted(rollouts: Rollouts, limits: Limits, *, logs: Sequence[Log] | None =
     data = DriveData.of(cars)
     if data.channel_count == 1:
         data = data.below(ONE_CHANNEL_HZ)
-    ranges = _Ranges(before, limits)
-    plain = LinearFit.of(LinearResponse(data, _readings(data, first), *_none(data)))
-    fit = LinearFit.of(_around(data, rollouts, ranges, before))
+    low, high = np.array([*limits.values()]).T
+    start, scale = np.array([before[name] for name in limits]), 0.5 * (high - low)
+
+    def values(z: FloatArray) -> dict[str, float]:
+        """Of parameters in prior standard deviations, half of each range, from where they are."""
+        return dict(zip(limits, np.clip(start + scale * z, low, high).tolist(), strict=True))
+
+    def linear(z: FloatArray) -> LinearFit:
+        """By a rollout beside each value."""
+        steps = np.where(start + scale * (z + _BESIDE) <= high, _BESIDE, -_BESIDE)
+        places = [z, *(z + np.diag(steps))]
+        here, *others = (_readings(data, outputs) for outputs in rollouts.each([values(place) for place in places]))
+        slopes = np.array([(other - here) / step for other, step in zip(others, steps, strict=True)])
+        return LinearFit(data, here, slopes, z, (low - start) / scale, (high - start) / scale)
+
+    readings, none = _readings(data, first), np.zeros(0)
+    plain = LinearFit(data, readings, np.zeros((0, *readings.shape)), none, none, none)
+    fit = linear(np.zeros(len(limits)))
     for _ in range(_ROUNDS - 1):
         left = rollouts.most - len(rollouts)
-        if np.abs(fit.z - fit.model.at).max() < _STAYS or left < fewest_rollouts(limits):
+        if np.abs(fit.z - fit.at).max() < _STAYS or left < fewest_rollouts(limits):
             break
-        fit = LinearFit.of(_around(data, rollouts, ranges, ranges.values(fit.z)))
-    values = ranges.values(fit.z)
-    better = rollouts.at(values)
+        fit = linear(fit.z)
+    car = values(fit.z)
+    better = rollouts.at(car)
     needed = fit.evidence_over(plain) > EFFECT_NATS
-    errors = dict(zip(limits, (fit.errors * ranges.scales).tolist(), strict=True))
+    errors = dict(zip(limits, (fit.errors * scale).tolist(), strict=True))
     found = tuple(
-        _difference(name, before[name], values[name], errors[name], data.frame_count - 1, needed) for name in limits
+        _difference(name, before[name], car[name], errors[name], data.frame_count - 1, needed) for name in limits
     )
     return Adjusted(better if any(p.differs for p in found) else first, found, rollouts)
 
@@ -297,47 +266,6 @@ def _difference(name: str, before: float, value: float, sd: float, freedom: int,
     )
     car = Quantity(value, sd, value - reach, value + reach)
     return ParameterDifference(name, before, car, needed and abs(value - before) > surely, own=True)
-
-
-@dataclass(frozen=True)
-class _Ranges:
-    """Parameters as z (parameter,): prior standard deviations, half of each range, from where they are `before`."""
-
-    before: Values
-    limits: Limits
-
-    @property
-    def scales(self) -> FloatArray:
-        return np.array([0.5 * (high - low) for low, high in self.limits.values()])
-
-    @property
-    def ends(self) -> FloatArray:
-        """Least and greatest z, (parameter, 2)."""
-        return np.array([self.z({n: ends[k] for n, ends in self.limits.items()}) for k in (0, 1)]).T
-
-    def z(self, values: Values) -> FloatArray:
-        return np.array([values[name] - self.before[name] for name in self.limits]) / self.scales
-
-    def values(self, z: FloatArray) -> dict[str, float]:
-        low, high = np.array(list(self.limits.values())).T
-        inside = np.clip(np.array([self.before[name] for name in self.limits]) + self.scales * z, low, high)
-        return dict(zip(self.limits, inside.tolist(), strict=True))
-
-
-def _around(data: DriveData, rollouts: Rollouts, ranges: _Ranges, values: Values) -> LinearResponse:
-    """The simulator linearised at `values`, by a rollout beside each."""
-    steps = {name: _BESIDE * (high - low) for name, (low, high) in ranges.limits.items()}
-    steps = {name: x if values[name] + x <= ranges.limits[name][1] else -x for name, x in steps.items()}
-    beside = [{**values, name: values[name] + step} for name, step in steps.items()]
-    center, *others = (_readings(data, outputs) for outputs in rollouts.each([values, *beside]))
-    scaled = np.array(list(steps.values())) / ranges.scales
-    slopes = np.array([(other - center) / step for other, step in zip(others, scaled, strict=True)])
-    return LinearResponse(data, center, slopes, ranges.z(values), ranges.ends)
-
-
-def _none(data: DriveData) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Slopes, place and limits of no parameters."""
-    return np.zeros((0, data.channel_count, len(data.time))), np.zeros(0), np.zeros((0, 2))
 
 
 def _readings(data: DriveData, outputs: Sequence[Log]) -> FloatArray:

@@ -184,31 +184,28 @@ def _told_values(values: Mapping[str, float]) -> str:
 _LEAST = 1e-9  # m/s² or m/s: an error, so that simulators without any have a ratio
 
 
-@dataclass(frozen=True, eq=False)
-class LogRatio:
-    """Logarithm of a ratio: `mean`, and what each block adds to it, `by_block` (block,), in the sum zero."""
+def ratio_of(log_ratio: FloatArray) -> Quantity:
+    """A ratio by its logarithm and what each block adds to that, (1 + block,), these in the sum zero."""
+    sure = float(student.ppf(0.95, len(log_ratio) - 2))  # pyright: ignore[reportUnknownMemberType]
+    return Quantity.of_logarithm(float(log_ratio[0]), _sd(log_ratio) ** 2, sure)
 
-    mean: float
-    by_block: FloatArray
 
-    @property
-    def sd(self) -> float:
-        """Standard deviation, by the spread between blocks."""
-        n = len(self.by_block)
-        return float(np.sqrt(n / (n - 1) * (self.by_block**2).sum()))
+def p_below(log_ratio: FloatArray, limit: float) -> float:
+    """Probability that a ratio, as `ratio_of` takes it, is below `limit`."""
+    away, sd = float(np.log(limit) - log_ratio[0]), _sd(log_ratio)
+    if sd == 0:
+        return float(away > 0)
+    return float(student.cdf(away / sd, len(log_ratio) - 2))  # pyright: ignore[reportUnknownMemberType]
 
-    @property
-    def ratio(self) -> Quantity:
-        """The ratio itself."""
-        sure = float(student.ppf(0.95, len(self.by_block) - 1))  # pyright: ignore[reportUnknownMemberType]
-        return Quantity.of_logarithm(self.mean, self.sd**2, sure)
 
-    def p_below(self, limit: float) -> float:
-        """Probability that the ratio is below `limit`."""
-        away = float(np.log(limit)) - self.mean
-        if self.sd == 0:
-            return float(away > 0)
-        return float(student.cdf(away / self.sd, len(self.by_block) - 1))  # pyright: ignore[reportUnknownMemberType]
+def _sd(log_ratio: FloatArray) -> float:
+    n = len(log_ratio) - 1
+    return float(np.sqrt(n / (n - 1) * (log_ratio[1:] ** 2).sum()))
+
+
+def log_root(squares: FloatArray) -> FloatArray:
+    """Logarithm of the root of the sum of squares (block,), and by how much each block moves it: (1 + block,)."""
+    return 0.5 * np.append(np.log(squares.sum()), squares / squares.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,25 +223,12 @@ class ScoredBlocks:
         horizon, (blocks,) = whole_runs([rows])
         return cls(rows, tuple(blocks), horizon)
 
-    def squares(self, errors: FloatArray) -> dict[str, FloatArray]:
-        """Squared errors by metric (block,), of a rollout's `errors` (channel, counted, group)."""
-        least = _LEAST**2 * self._rows
-        return {name: np.maximum(x, least) for name, x in self.rows.squares(errors, self.blocks).items()}
-
-    def log_ratio(self, one: Mapping[str, FloatArray], two: Mapping[str, FloatArray]) -> LogRatio:
-        """Of the errors of `two` to those of `one`, squares (block,) by metric; the mean over the metrics."""
-        mean = float(np.mean([np.log(two[m].sum() / one[m].sum()) / 2 for m in one]))
-        return LogRatio(mean, np.mean([(two[m] / two[m].sum() - one[m] / one[m].sum()) / 2 for m in one], 0))
-
-    def error(self, squares: FloatArray) -> Quantity:
-        """Root mean square of errors, squares (block,)."""
-        rows = self._rows
-        share = (squares / squares.sum() - rows / rows.sum()) / 2
-        return LogRatio(float(np.log(squares.sum() / rows.sum())) / 2, share).ratio
-
-    @property
-    def _rows(self) -> FloatArray:
-        return np.array([(b.stop - b.start) * self.rows.group for b in self.blocks], dtype=float)
+    def log_errors(self, errors: FloatArray) -> dict[str, FloatArray]:
+        """Logarithms of root mean squares by metric, (1 + block,) as `ratio_of` takes them, of a rollout's `errors`
+        (channel, counted, group)."""
+        rows = np.array([(b.stop - b.start) * self.rows.group for b in self.blocks], dtype=float)
+        squares = self.rows.squares(errors, self.blocks)
+        return {name: log_root(np.maximum(x, _LEAST**2 * rows)) - log_root(rows) for name, x in squares.items()}
 
 
 _SAME = 0.01  # relative difference of parameters that is none
@@ -263,36 +247,34 @@ def differences(
     own = scored.rows.rolled_out(base)
     sides = {name: [_values(surrogate, name) for surrogate in surrogates] for name in _parts(chains)}
     apart = [name for name, (one, two) in sides.items() if not _alike(one, two)]
-    known: dict[frozenset[str], LogRatio] = {}
-    as_it_is = scored.squares(errors)
+    known: dict[frozenset[str], FloatArray] = {}
 
-    def with_parts(names: frozenset[str]) -> LogRatio:
-        """Of the error with these parts as in the other one to what it is."""
+    def with_parts(names: frozenset[str]) -> FloatArray:
+        """Of the error with these parts as in the other one, the mean over the metrics."""
         if names not in known:
             changed = base
             for name in sorted(names):
                 changed = _with_part(changed, donor, name)
             moved = errors + own - scored.rows.rolled_out(changed) if names else errors
-            known[names] = scored.log_ratio(as_it_is, scored.squares(moved))
+            known[names] = np.mean([*scored.log_errors(moved).values()], 0)
         return known[names]
 
-    alone = sorted(apart, key=lambda name: -abs(with_parts(frozenset((name,))).mean))
+    as_it_is = with_parts(frozenset())
+    alone = sorted(apart, key=lambda name: -abs((with_parts(frozenset((name,))) - as_it_is)[0]))
     groups = {name: frozenset((name,)) for name in alone[:_MOST]}
     if alone[_MOST:]:
         groups[OTHERS] = frozenset(alone[_MOST:])
     found = []
     for name, own_parts in groups.items():
         others = [group for other, group in groups.items() if other != name]
-        mean, by_block = 0.0, np.zeros(len(scored.blocks))
+        log_ratio = np.zeros(1 + len(scored.blocks))
         for count in range(len(others) + 1):
             weight = factorial(count) * factorial(len(others) - count) / factorial(len(others) + 1)
             for chosen in combinations(others, count):
                 there = frozenset().union(*chosen)
-                after, before = with_parts(there | own_parts), with_parts(there)
-                mean += weight * (after.mean - before.mean)
-                by_block += weight * (after.by_block - before.by_block)
+                log_ratio += weight * (with_parts(there | own_parts) - with_parts(there))
         one, two = sides.get(name, (None, None))
-        found.append(Difference(name, one, two, LogRatio(mean, by_block).ratio, tuple(sorted(own_parts))))
+        found.append(Difference(name, one, two, ratio_of(log_ratio), tuple(sorted(own_parts))))
     return tuple(sorted(found, key=lambda difference: difference.ratio.mean))
 
 
@@ -385,9 +367,9 @@ def compare_simulators(
     ]
     scored = ScoredBlocks.of(CountedRows.of(cars))
     errors = [scored.rows.measured - scored.rows.of_logs(outputs) for outputs, _ in rolled]
-    one, two = (scored.squares(e) for e in errors)
-    both = scored.log_ratio(one, two)
-    far = 0 if both.mean < 0 else 1
+    one, two = (scored.log_errors(e) for e in errors)
+    both = np.mean([two[metric] - one[metric] for metric in one], 0)
+    far = 0 if both[0] < 0 else 1
     told = [
         _told(simulator, surrogate, offsets, is_plant=own is not None)
         for (simulator, own), surrogate, (_, offsets) in zip(given, surrogates, rolled, strict=True)
@@ -397,16 +379,12 @@ def compare_simulators(
         first=told[0],
         second=told[1],
         errors={
-            metric: ErrorsOfTwo(
-                scored.error(one[metric]),
-                scored.error(two[metric]),
-                scored.log_ratio({metric: one[metric]}, {metric: two[metric]}).ratio,
-            )
+            metric: ErrorsOfTwo(ratio_of(one[metric]), ratio_of(two[metric]), ratio_of(two[metric] - one[metric]))
             for metric in one
         },
-        ratio=both.ratio,
-        p_first=1 - both.p_below(1 / (1 - MATERIAL)),
-        p_second=both.p_below(1 - MATERIAL),
+        ratio=ratio_of(both),
+        p_first=1 - p_below(both, 1 / (1 - MATERIAL)),
+        p_second=p_below(both, 1 - MATERIAL),
         level=level,
         blocks=len(scored.blocks),
         horizon_s=scored.horizon_s,

@@ -19,14 +19,14 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from scipy.integrate import trapezoid
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
 from avtorch.external.adjusting import Adjusted, Rollouts, adjusted, fewest_rollouts
 from avtorch.external.driving import aligned, driven_along, in_drives, side_by_side
-from avtorch.external.simulator import Limits, Simulator, Values, check_methods, values_of, with_values
+from avtorch.external.simulator import DrivenPlant, Limits, Simulator, Values, check_methods, values_of, with_values
 from avtorch.external.surrogate import Surrogate, surrogate_of
+from avtorch.gap.linearised import linearised
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.simulator_under_test import SAME_KIND, ParameterDifference, SimulatorUnderTest
@@ -267,32 +267,12 @@ def without_discrepancy(log: Log, simulated: Log, surrogate: GapPlant) -> Log:
     return replace(log, **{name: shared.get(name) for name in channels})
 
 
-_STEP_MPS2, _RATE_HZ = 0.5, 100
-_BEFORE_S, _AFTER_S, _SETTLED_S = 1.0, 9.0, 1.0
-
-
 def lateness(plant: GapPlant, speed: float) -> float:
-    """Mean delay [s] of the acceleration that answers a step in the command, at a speed [m/s].
-
-    It is the area between the step and its answer, over the answer's height: `T_L` for GLVD, and the sum of the delays
-    of all that the command passes. At least `T_L`, also for a plant that does not answer a step of 0.5 m/s².
-    """
-    time = np.arange(round((_BEFORE_S + _AFTER_S) * _RATE_HZ)) / _RATE_HZ
-    step = np.where(time < _BEFORE_S, 0.0, _STEP_MPS2)
-    still = 0.0 * time
-
-    def accel(command: FloatArray) -> FloatArray:
-        drive = Log.from_arrays(time=time, accel_cmd=command, accel=still, speed=still + max(speed, 1.0))
-        return responses(drive, plant)["accel"]
-
-    # without the forces that act whatever the command
-    answer = accel(step) - accel(still)
-    height = float(answer[-round(_SETTLED_S * _RATE_HZ) :].mean())
-    least = float(plant.T_L)
-    if abs(height) < 1e-3 * _STEP_MPS2:
-        return least
-    after = time >= _BEFORE_S
-    return max(float(trapezoid(1.0 - answer[after] / height, dx=1 / _RATE_HZ)), least)
+    """Delay [s] of the measured acceleration behind slow commands, at a speed [m/s]: `T_L` for GLVD, and the sum of the
+    delays of all that the command passes. At least `T_L`, also for a plant that does not answer a step of 0.5 m/s²."""
+    chain = linearised(plant, speed=max(speed, 1.0))
+    answer = chain.motion[0, 0] * chain.sensed[0, 0]
+    return max(-float(answer.angle()) / float(chain.omega[0]), float(plant.T_L))
 
 
 HORIZON_S = 10.0
@@ -375,3 +355,71 @@ def _of_a_size(found: Diagnosis, effect: str, simulator: GapPlant) -> bool:
         if key in own:
             return abs(float(own[key])) > SAME_KIND * abs(car.mean)
     return False
+
+
+class Wrapped:
+    """A `Simulator`: another one, and what a car (`car`) does beyond its surrogate (`own`).
+
+    What is added to its output is the difference between the surrogate with and without what was found: what the
+    diagnosis itself rolled out. That is exact for effects that commute with the simulator (a delay, a sensor, a force)
+    or with which its surrogate commutes as it does. Speed gains what the added acceleration integrates to; the
+    simulator's own forces do not learn of it.
+    """
+
+    def __init__(self, simulator: Simulator, own: GapPlant, car: GapPlant) -> None:
+        self.simulator, self._without, self._with = simulator, DrivenPlant(own), DrivenPlant(car)
+
+    def reset(self, *, speed: float, accel: float) -> None:
+        """Begin a drive, see `Simulator.reset`."""
+        self.simulator.reset(speed=speed, accel=accel)
+        for chain in (self._without, self._with):
+            chain.reset(speed=speed, accel=accel)
+
+    def step(self, accel_cmd: float, dt: float) -> tuple[float, float]:
+        """Hold the command, see `Simulator.step`."""
+        accel, speed = self.simulator.step(accel_cmd, dt)
+        with_it, without = self._with.step(accel_cmd, dt), self._without.step(accel_cmd, dt)
+        return accel + with_it[0] - without[0], speed + with_it[1] - without[1]
+
+
+def wrap(simulator: Simulator, found: Diagnosis) -> Wrapped:
+    """`simulator` with what `found` says that it lacks, and with the parameters of the car.
+
+    Raises `InputError` for a diagnosis that names nothing and finds no parameter wrong, or of no external simulator.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch import ExternalSimulator, Leader, diagnose, simulate
+        >>> from avtorch.external import wrap
+        >>> from avtorch.gap import ConstantResistance, plant
+        >>> class Mine:
+        ...     def reset(self, *, speed, accel):
+        ...         self.speed, self.accel = speed, accel
+        ...     def step(self, accel_cmd, dt):
+        ...         before = self.accel
+        ...         self.accel = accel_cmd + np.exp(-dt / 0.3) * (before - accel_cmd)
+        ...         self.speed += dt * (before + self.accel) / 2
+        ...         return self.accel, self.speed
+        >>> car = plant([ConstantResistance(0.3)], T_L=0.3, sigma=0.02)
+        >>> log = simulate(Leader.default(start=30.0, duration=40.0, dt=0.05), plant=car).log()
+        >>> candidates = ["constant_resistance", "dead_time"]
+        >>> found = diagnose(log, baseline=ExternalSimulator(Mine), effects=candidates, pairs=False)
+        >>> found.verdict.names
+        ('constant_resistance',)
+        >>> better = wrap(Mine(), found)
+        >>> better.reset(speed=20.0, accel=0.0)
+        >>> speed = [better.step(0.0, 0.05)[1] for _ in range(200)][-1]  # it slows down by itself
+        >>> bool(16.5 < speed < 17.5)
+        True
+    """
+    if found.tested is None:
+        raise InputError("found: is of no external simulator; needs diagnose(logs, baseline=ExternalSimulator(...))")
+    if found.plant is None and not found.tested.wrong:
+        raise InputError(f"found: the verdict is {found.verdict.name}; there is nothing to put around the simulator")
+    own = found.tested.surrogate
+    values = {p.name: p.car.mean for p in found.tested.parameters if p.name in ("T_L", "K_L") and not p.own}
+    car = own.with_values(values) if found.plant is None else found.plant
+    adjusted = {p.name: p.car.mean for p in found.tested.parameters if p.own}
+    if any(p.own for p in found.tested.wrong):
+        simulator = with_values(simulator, adjusted)
+    return Wrapped(simulator, own, car)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.mapping import PEDALS
-from avtorch.io.units import to_si, unit_named
+from avtorch.io.units import stated_unit, to_si
 from avtorch.logcheck.vocabulary import header_of, likeness
 
 SIGNALS = ("accel_cmd", "accel", "speed")
@@ -92,15 +92,12 @@ def _fits(v: Variable, signal: str) -> bool:
 
 def _named(source: str, signal: str, name: str, variables: list[Variable], able: list[Variable]) -> Variable:
     # what is given may also be a local variable, but not the other way round
-    may = able if signal != "accel" and signal != "speed" else [v for v in variables if v.causality != "input"]
-    for v in may:
-        if v.name == name:
-            return v
-    other = next((v for v in variables if v.name == name), None)
-    found = "there is no such real variable"
-    if other is not None:
-        found = f"its causality is {other.causality}; {_CAUSALITY[signal]} is needed"
-    raise InputError(f"{source}: {signal} = {quoted(name)}: {found}; candidates: {_names(able)}")
+    may = [v for v in variables if v.causality != "input"] if signal in ("accel", "speed") else able
+    found = next((v for v in may if v.name == name), None)
+    if found is None:
+        what = f"needs {_CAUSALITY[signal]}, a real variable; candidates: {_names(able)}"
+        raise InputError(f"{source}: {signal} = {quoted(name)}: {what}")
+    return found
 
 
 def _recognised(source: str, signal: str, able: list[Variable]) -> tuple[Variable, str]:
@@ -137,7 +134,7 @@ def _port(source: str, signal: str, v: Variable, how: str, units: Mapping[str, s
     given = units.get(signal, units.get(signal.removesuffix("0")))
     head = f"{signal}: variable {quoted(v.name)} ({how})"
     if given is not None:
-        return Port(v, _factor(to_si(kind, given)), f"{head}, in {printable(given, 20)} as given")
+        return Port(v, _factor(kind, given), f"{head}, in {printable(given, 20)} as given")
     factor = _stated(v, kind)
     if factor is not None:
         return Port(v, factor, f"{head}, in {printable(v.unit or _SI[kind], 20)}")
@@ -146,9 +143,9 @@ def _port(source: str, signal: str, v: Variable, how: str, units: Mapping[str, s
             f"{source}: {signal} is variable {quoted(v.name)} in {quoted(v.unit or '', 20)}; needs a variable in a "
             f'unit such as {_SI[kind]}, or a line {signal} = "{_SI[kind]}" below [fmu.unit] in its TOML file'
         )
-    header = header_of(v.name)
-    if header.unit is not None and (known := _known(kind, header.unit)) is not None:
-        return Port(v, known, f"{head}, in {header.unit} by its name")
+    unit = header_of(v.name).unit
+    if unit is not None and stated_unit(kind, unit) is not None:
+        return Port(v, _factor(kind, unit), f"{head}, in {unit} by its name")
     return Port(v, 1.0, f"{head}, which states no unit: taken as {_SI[kind]}")
 
 
@@ -160,20 +157,11 @@ def _stated(v: Variable, kind: str) -> float | None:
     """The factor to SI of the unit that a variable states, where that is one of an acceleration or of a speed."""
     if v.powers:
         return v.factor if v.powers == _POWERS[kind] and v.offset == 0 else None
-    if _without_unit(v) or v.unit is None:
-        return None
-    for text in (v.unit, v.unit.replace(".", "").replace("*", "")):  # FMI writes m.s-2
-        if (unit := unit_named(text)) is not None and (known := _known(kind, unit)) is not None:
-            return known
-    return None
+    text = "" if _without_unit(v) else v.unit or ""
+    # FMI writes m.s-2
+    unit = stated_unit(kind, text) or stated_unit(kind, text.replace(".", "").replace("*", ""))
+    return None if unit is None else _factor(kind, unit)
 
 
-def _known(kind: str, unit: str) -> float | None:
-    try:
-        return _factor(to_si(kind, unit))
-    except InputError:
-        return None
-
-
-def _factor(convert: Callable[[Any], Any]) -> float:
-    return float(convert(np.ones(())))
+def _factor(kind: str, unit: str) -> float:
+    return float(to_si(kind, unit)(np.ones(1))[0])

@@ -43,7 +43,7 @@ def fleet_answer(found: LogList, folder: FleetFolder, settings: FleetSettings) -
     if any(beliefs.values()):
         from avtorch.fleet.population import population  # needs torch
 
-        common, beside = population(beliefs, settings.seed)
+        common, beside = population(beliefs)
     diagnosed = {car["car"]: drives for car in cars if (drives := car.pop("diagnosed"))}
     has = {car: car_causes(drives) for car, drives in diagnosed.items()}
     causes = fleet_causes(has)
@@ -53,7 +53,7 @@ def fleet_answer(found: LogList, folder: FleetFolder, settings: FleetSettings) -
 
         name = cause["name"]
         told = {car: [one["sizes"] for one in diagnosed[car]] for car, (named, _) in has.items() if name in named}
-        cause["parameters"], own = effect_sizes(name, told, settings.seed)
+        cause["parameters"], own = effect_sizes(name, told)
         for car, values in own.items():
             sizes.setdefault(car, {})[name] = values
     for car in cars:

@@ -23,10 +23,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.optimize import lsq_linear
 from torch import Tensor
 
 from avtorch.arrays import FloatArray
@@ -43,24 +43,6 @@ NEEDED = ("speed", "spacing", "lead_speed")
 _WIDER = 2.0  # a delay can be far shorter than is typical, down to none
 
 
-@dataclass(frozen=True)
-class Coordinate:
-    """One coordinate of a fit, standard normal a priori: the parameter's key, and by how much its prior is widened."""
-
-    key: str
-    parameter: Parameter
-    wider: float = 1.0
-
-    def value(self, z: FloatArray) -> Tensor:
-        """The parameter at `z`, in its shape."""
-        return self.parameter.constrain(torch.as_tensor(self.wider * z))
-
-    def z_of(self, value: float) -> float:
-        """The coordinate of a value, at most four standard deviations from the prior's centre."""
-        z = float(self.parameter.unconstrain(torch.tensor(value, dtype=torch.float64))) / self.wider
-        return float(np.clip(z, -4.0, 4.0))
-
-
 @dataclass(frozen=True, eq=False)
 class Followed:
     """`law`, and a plant with a dead time or without, over the speed of a log; `data`: the log in coefficients.
@@ -75,11 +57,11 @@ class Followed:
     seen: tuple[FollowerMeasurements, ...] = field(repr=False)
 
     @cached_property
-    def coordinates(self) -> tuple[Coordinate, ...]:
-        """The law's parameters by `law.parameter`, `T_L` [s], and the dead time [s]."""
-        law = [Coordinate(f"law.{p.name}", p) for p in self.law.parameters]
-        car = [(key, p) for key, p in self.plant.parameters().items() if key != "K_L"]
-        return (*law, *(Coordinate(key, p, 1.0 if key == "T_L" else _WIDER) for key, p in car))
+    def coordinates(self) -> dict[str, Parameter]:
+        """The law's parameters by `law.parameter`, `T_L` [s], and the dead time [s]; standard normal a priori."""
+        law = {f"law.{p.name}": p for p in self.law.parameters}
+        car = {key: p if key == "T_L" else _widened(p) for key, p in self.plant.parameters().items() if key != "K_L"}
+        return law | car
 
     @property
     def size(self) -> int:
@@ -92,11 +74,13 @@ class Followed:
 
     def values(self, z: FloatArray) -> dict[str, Tensor]:
         """Values (column,) by key, for `z` (column, coordinate)."""
-        return {c.key: c.value(z[:, i]) for i, c in enumerate(self.coordinates)}
+        return {key: p.constrain(torch.as_tensor(z[:, i])) for i, (key, p) in enumerate(self.coordinates.items())}
 
     def z_of(self, values: Mapping[str, float]) -> FloatArray:
-        """Coordinates (coordinate,) for values by key; missing ones are at their prior's centre."""
-        return np.array([c.z_of(values[c.key]) if c.key in values else 0.0 for c in self.coordinates])
+        """Coordinates (coordinate,) for values by key, at most four standard deviations from their priors' centres,
+        where missing ones are."""
+        there = [(p, values.get(key, float(p.typical()))) for key, p in self.coordinates.items()]
+        return np.clip([float(p.unconstrain(torch.tensor(x, dtype=torch.float64))) for p, x in there], -4.0, 4.0)
 
     def residual(self, z: FloatArray) -> FloatArray:
         """Measured less simulated coefficients of the differenced speed, (column, frame, bin)."""
@@ -143,6 +127,12 @@ def car_of(values: Mapping[str, float]) -> GapPlant:
     return plant([] if delay is None else [kind.of({str(kind.shift): delay})], T_L=values["T_L"], K_L=1.0)
 
 
+def _widened(p: Parameter) -> Parameter:
+    """The parameter with a prior of more standard deviations."""
+    low, high = p.constrain(_WIDER * p.unconstrain(torch.tensor([p.low, p.high], dtype=torch.float64))).tolist()
+    return replace(p, low=low, high=high)
+
+
 def _over(log: Log, law: HeadwayLaw, car: GapPlant) -> Followed:
     data = DriveData.of(replace(log, accel=None, accel_cmd=np.zeros(log.rows)))
     rows = torch.as_tensor(data.source[:, None] + np.arange(data.group))
@@ -167,55 +157,11 @@ _PRIORS = np.array(
     ]
 )
 """Mean and standard deviation of the logarithms. A controller's own doings are as large as a gust."""
-_NOISE_FARTHEST = 4.0  # standard deviations
-_NOISE_STEP = 1e-3
-_NOISE_ITERATIONS, _NOISE_ENOUGH = 20, 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class LoopNoise:
-    """`w` (size,): the five sizes and times, standard normal a priori; `variance` (bin,) of coefficients [(m/s²)²].
-
-    `value` [nats]: log density of the residual and of `w`.
-    """
-
-    w: FloatArray
-    variance: FloatArray = field(repr=False)
-    value: float
-
-    @classmethod
-    def of(cls, data: DriveData, residual: FloatArray, lag: float, start: FloatArray | None = None) -> LoopNoise:
-        """The likeliest for a residual (frame, bin), `lag` [s] the actuator's; by scoring steps that gain."""
-        energy, frames = (residual**2).sum(0), len(residual)
-        w, damping = np.zeros(len(_PRIORS)) if start is None else start, 1e-2
-        shape, value = _noise_at(data, energy, frames, lag, w)
-        for _ in range(_NOISE_ITERATIONS):
-            ahead = [_log_variance(data, lag, w + step) for step in _NOISE_STEP * np.eye(len(w))]
-            slopes = (np.stack(ahead) - shape) / _NOISE_STEP
-            information = 0.5 * frames * slopes @ slopes.T + np.eye(len(w))
-            gradient = 0.5 * slopes @ (energy * np.exp(-shape) - frames) - w
-            gain = 0.0
-            while damping < 1e6:
-                step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
-                new = np.clip(w + np.clip(step, -1.0, 1.0), -_NOISE_FARTHEST, _NOISE_FARTHEST)
-                tried, after = _noise_at(data, energy, frames, lag, new)
-                if after > value:
-                    gain, w, shape, value, damping = after - value, new, tried, after, damping / 10
-                    break
-                damping *= 8
-            if gain < _NOISE_ENOUGH:
-                break
-        return cls(w, np.exp(shape), value)
-
-
-def _noise_at(data: DriveData, energy: FloatArray, frames: int, lag: float, w: FloatArray) -> tuple[FloatArray, float]:
-    """Logarithm of the variance (bin,), and the log density [nats]."""
-    shape = _log_variance(data, lag, w)
-    nats = -0.5 * float((energy * np.exp(-shape) + frames * shape).sum())
-    return shape, nats - 0.5 * float(w @ w)
 
 
 def _log_variance(data: DriveData, lag: float, w: FloatArray) -> FloatArray:
+    """Logarithm of the noise's variance (bin,) by the five sizes and times `w`, standard normal a priori; `lag` [s] is
+    the actuator's."""
     p, ratio, s, tau, r = np.exp(_PRIORS[:, 0] + _PRIORS[:, 1] * w)
     turn = 2 * np.pi * data.frequency
     gain = np.sinc(2 * data.frequency * data.dt)
@@ -226,8 +172,8 @@ def _log_variance(data: DriveData, lag: float, w: FloatArray) -> FloatArray:
 _ITERATIONS = 30
 _ENOUGH = 0.01  # nats that a last step gains
 _STEP = 1e-4  # of finite differences
-_LONGEST = 1.0  # step, in standard deviations of the prior
-_FARTHEST = 5.0
+_LONGEST, _SHORTEST = 1.0, 1e-4  # steps, in standard deviations of the prior
+_FARTHEST, _NOISE_FARTHEST = 5.0, 4.0
 _DRAWS = 2000
 _PART_S = 60.0
 _PARTS = 6
@@ -236,20 +182,22 @@ _DELAYS_S = (0.3, 1.2)
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """`z` (coordinate,) at the mode, and its `covariance`.
-
-    `noise` (bin,): variance of the differenced speed's coefficients [(m/s²)²].
-    """
+    """`z` (coordinate,) at the mode, and its `covariance`; `w`: the noise's sizes and times there."""
 
     candidate: Followed = field(repr=False)
     z: FloatArray
+    w: FloatArray = field(repr=False)
     covariance: FloatArray = field(repr=False)
-    noise: FloatArray = field(repr=False)
 
     @property
     def values(self) -> Mapping[str, float]:
         """Parameters at the mode, by key: `law.*`, `T_L` [s], `dead_time.delay_s` [s]."""
         return {k: float(v[0]) for k, v in self.candidate.values(self.z[None]).items()}
+
+    @property
+    def noise(self) -> FloatArray:
+        """Variance (bin,) of the differenced speed's coefficients [(m/s²)²]."""
+        return np.exp(_log_variance(self.candidate.data, self.values["T_L"], self.w))
 
     def draws(self, covariance: FloatArray, *, seed: int = 0) -> dict[str, FloatArray]:
         """Parameters (draw,) of a normal posterior in `z` with this covariance."""
@@ -262,10 +210,12 @@ class Identified:
 
 def identified(candidate: Followed, *, start: Identified | None = None) -> Identified:
     """The fit to the candidate's log, from a short and a long delay, or from another fit's place."""
-    places = [_mode(candidate, z) for z in (_starts(candidate) if start is None else [start.z])]
-    best = max(places, key=lambda place: place.value)
-    covariance = np.asarray(np.linalg.inv(_curvature(candidate, best)[0]), np.float64)
-    return Identified(candidate, best.z, covariance, best.noise.variance)
+    starts = _starts(candidate) if start is None else [np.append(start.z, start.w)]
+    cost = {tuple(x): value for x, value in (_mode(candidate, start) for start in starts)}
+    best = np.array(min(cost, key=lambda x: cost[x]))
+    n = candidate.size
+    covariance = np.asarray(np.linalg.inv(_expansion(candidate, best)[1]), np.float64)[:n, :n]
+    return Identified(candidate, best[:n], best[n:], covariance)
 
 
 def widened(found: Identified) -> FloatArray:
@@ -291,53 +241,52 @@ def widened(found: Identified) -> FloatArray:
     return found.covariance * np.outer(wider, wider)
 
 
-class _Place(NamedTuple):
-    """`value` [nats] of log likelihood and prior at `z` (coordinate,), the `residual` (frame, bin), its `noise`."""
-
-    z: FloatArray
-    value: float
-    residual: FloatArray
-    noise: LoopNoise
-
-
-def _at(own: Followed, z: FloatArray, before: LoopNoise | None = None) -> _Place:
-    residual, lag = own.residual(z[None])[0], float(own.values(z[None])["T_L"])
-    noise = LoopNoise.of(own.data, residual, lag, None if before is None else before.w)
-    return _Place(z, noise.value - 0.5 * float(z @ z), residual, noise)
-
-
-def _curvature(own: Followed, at: _Place) -> tuple[FloatArray, FloatArray]:
-    """Information (coordinate, coordinate) and gradient (coordinate,) under the noise at a place; all derivatives are
-    one batch of rollouts."""
-    ahead = own.residual(at.z + _STEP * np.eye(own.size))
-    sd = np.sqrt(at.noise.variance)
-    slopes = ((at.residual - ahead) / (_STEP * sd)).reshape(own.size, -1)
-    return slopes @ slopes.T + np.eye(own.size), slopes @ (at.residual / sd).ravel() - at.z
-
-
-def _mode(own: Followed, z: FloatArray) -> _Place:
-    """Gauss-Newton with damped steps. A step across a crease of the delay gains nothing and is shortened."""
-    at, damping = _at(own, z), 1e-3
+def _mode(own: Followed, start: FloatArray) -> tuple[FloatArray, float]:
+    """The likeliest coordinates and noise, and `_cost` there, by scoring steps within limits and a box of trust. One
+    across a crease of the delay gains nothing and is shortened."""
+    farthest = np.repeat([_FARTHEST, _NOISE_FARTHEST], [own.size, len(_PRIORS)])
+    x, cost, trust = start, _cost(own, start), _LONGEST
     for _ in range(_ITERATIONS):
-        information, gradient = _curvature(own, at)
-        better = None
-        while better is None and damping < 1e4:
-            step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
-            step *= min(1.0, _LONGEST / max(float(np.abs(step).max()), 1e-12))
-            new = _at(own, np.clip(at.z + step, -_FARTHEST, _FARTHEST), at.noise)
-            if new.value > at.value:
-                better = new
-            else:
-                damping = max(damping * 8, 1e-2)
-        if better is None:
-            break
-        gain, at, damping = better.value - at.value, better, damping / 10
+        gradient, information = _expansion(own, x)
+        root = np.linalg.cholesky(information)
+        gain = 0.0
+        while gain <= 0 and trust > _SHORTEST:
+            ends = np.maximum(-farthest - x, -trust) - 1e-12, np.minimum(farthest - x, trust) + 1e-12
+            step = lsq_linear(root.T, -np.linalg.solve(root, gradient), ends, "bvls").x
+            gain = cost - _cost(own, x + step)
+            trust = min(4 * trust, _LONGEST) if gain > 0 else trust / 8
+        if gain > 0:
+            x, cost = x + step, cost - gain
         if gain < _ENOUGH:
             break
-    return at
+    return x, cost
+
+
+def _cost(own: Followed, x: FloatArray) -> float:
+    """Minus the log posterior [nats] of coordinates and then noise, x (size,)."""
+    z, w = x[None, : own.size], x[own.size :]
+    residual = own.residual(z)[0]
+    shape = _log_variance(own.data, float(own.values(z)["T_L"]), w)
+    return 0.5 * float(((residual**2) * np.exp(-shape) + shape).sum() + x @ x)
+
+
+def _expansion(own: Followed, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gradient (size,) of `_cost` and Fisher's information (size, size); all rollouts are one batch."""
+    n = own.size
+    near = x + np.vstack([np.zeros(len(x)), _STEP * np.eye(len(x))])
+    residual, *moved = own.residual(near[: n + 1, :n])
+    lags = own.values(near[:, :n])["T_L"].tolist()
+    shape, *shapes = (_log_variance(own.data, lag, w) for lag, w in zip(lags, near[:, n:], strict=True))
+    by_shape = (np.stack(shapes) - shape) / _STEP
+    sd = np.exp(0.5 * shape)
+    left = residual / sd
+    slopes = np.zeros((len(x), left.size))
+    slopes[:n] = ((np.stack(moved) - residual) / (_STEP * sd)).reshape(n, -1)
+    gradient = slopes @ left.ravel() + 0.5 * by_shape @ (1 - left**2).sum(0) + x
+    return gradient, slopes @ slopes.T + 0.5 * len(left) * by_shape @ by_shape.T + np.eye(len(x))
 
 
 def _starts(candidate: Followed) -> list[FloatArray]:
-    if delay_key() not in [c.key for c in candidate.coordinates]:
-        return [np.zeros(candidate.size)]
-    return [candidate.z_of({delay_key(): delay}) for delay in _DELAYS_S]
+    noise = np.zeros(len(_PRIORS))
+    delays = _DELAYS_S if delay_key() in candidate.coordinates else _DELAYS_S[:1]
+    return [np.append(candidate.z_of({delay_key(): delay}), noise) for delay in delays]

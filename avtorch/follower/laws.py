@@ -34,14 +34,6 @@ class FollowerMeasurements(NamedTuple):
     lead_speed: Tensor
 
 
-class Slopes(NamedTuple):
-    """Slopes of the demand for small motions: per metre of spacing, and per m/s of own and of lead speed."""
-
-    spacing: Tensor
-    speed: Tensor
-    lead_speed: Tensor
-
-
 class HeadwayLaw(Protocol):
     """A headway law by `name`, with `parameters`."""
 
@@ -54,10 +46,6 @@ class HeadwayLaw(Protocol):
 
     def spacing(self, values: Values, speed: float) -> Tensor:
         """Equilibrium spacing (...) [m] at `speed` [m/s], `values` (...)."""
-        ...
-
-    def slopes(self, values: Values, speed: float) -> Slopes:
-        """Slopes in equilibrium at `speed` [m/s], `values` (...)."""
         ...
 
 
@@ -83,10 +71,6 @@ class ConstantTimeGap:
 
     def spacing(self, values: Values, speed: float) -> Tensor:
         return values["standstill_m"] + values["time_gap_s"] * speed
-
-    def slopes(self, values: Values, speed: float) -> Slopes:
-        k_s, k_v, h = (values[name] for name in ("spacing_gain_per_s2", "speed_gain_per_s", "time_gap_s"))
-        return Slopes(k_s, -(k_s * h + k_v), k_v)
 
 
 @dataclass(frozen=True)
@@ -114,17 +98,6 @@ class IntelligentDriver:
     def spacing(self, values: Values, speed: float) -> Tensor:
         free = (1 - (speed / values["desired_speed_mps"]) ** 4).clamp_min(1e-3)
         return (values["standstill_m"] + values["time_gap_s"] * speed) / free.sqrt()
-
-    def slopes(self, values: Values, speed: float) -> Slopes:
-        a, b, h, s_0, v_0 = (values[p.name] for p in self.parameters)
-        wanted, spacing = s_0 + h * speed, self.spacing(values, speed)
-        on_wanted = -2 * a * wanted / spacing**2
-        closing = speed / (2 * (a * b).sqrt())
-        return Slopes(
-            spacing=2 * a * wanted**2 / spacing**3,
-            speed=-4 * a * speed**3 / v_0**4 + on_wanted * (h + closing),
-            lead_speed=-on_wanted * closing,
-        )
 
 
 LAWS: dict[str, HeadwayLaw] = {law.name: law for law in (ConstantTimeGap(), IntelligentDriver())}
@@ -234,8 +207,11 @@ def loop_stability(law: HeadwayLaw, draws: Mapping[str, FloatArray], speeds: Seq
     chain = actuator(frequencies(points=500), lag, torch.ones_like(lag), delay)
     out = []
     for speed in speeds:
-        s, v, lead = law.slopes(own, speed)
-        gains = torch.stack(torch.broadcast_tensors(s, lead, torch.zeros_like(lead)), -1)
+        rest = torch.full_like(lag, speed)
+        at = [x.detach().requires_grad_() for x in (law.spacing(own, speed), rest, rest)]
+        # of the demand for small motions: per metre of spacing, and per m/s of own and of lead speed
+        s, v, lead = torch.autograd.grad(law.command(own, FollowerMeasurements(*at)).sum(), at)
+        gains = torch.stack([s, lead, torch.zeros_like(lead)], -1)
         seen = chain_verdict(chain, (-v - lead) / s, gains)
         peaks = seen.peak_gain[seen.locally_stable].numpy()
         out.append(

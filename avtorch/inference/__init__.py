@@ -22,7 +22,6 @@ from avtorch.inference.density import (
 from avtorch.inference.form import ExcitationRule, Form, JerkForm, WindowLikelihood
 from avtorch.inference.jerk import JerkDensity, JerkPoints, JerkStatistics, jerk_log_likelihood
 from avtorch.inference.map import Mode, find_mode
-from avtorch.inference.population import PopulationMargin
 from avtorch.inference.posterior import Posterior
 from avtorch.inference.quadrature import Quadrature, integrate
 from avtorch.inference.sampler import sample
@@ -44,7 +43,6 @@ __all__ = [
     "JerkPoints",
     "JerkStatistics",
     "Mode",
-    "PopulationMargin",
     "Posterior",
     "Quadrature",
     "SamplerSettings",

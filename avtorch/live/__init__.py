@@ -20,10 +20,9 @@ Example:
 from avtorch.live.car import Answer as Answer
 from avtorch.live.car import LiveSettings, LiveWatch
 from avtorch.live.mqtt import MqttAddress, MqttSink, MqttSource
-from avtorch.live.played_log import PlayedLog
 from avtorch.live.prometheus import Metrics as Metrics
 from avtorch.live.source import REFUSED as REFUSED
-from avtorch.live.source import Batch, FileSource, LineParser, Row
+from avtorch.live.source import Batch, FileSource, LineParser, PlayedLog, Row
 from avtorch.live.source import Counts as Counts
 from avtorch.live.source import Source as Source
 from avtorch.live.source import StreamSource as StreamSource

@@ -1,20 +1,17 @@
 """Commands that are no accelerations: maps from them to the acceleration they demand, by `fit_pedals`."""
 
-from avtorch.pedals.export import MapTable, accel_table, brake_table, read_map, write_map
+from avtorch.pedals.export import MapTable, accel_table, brake_table, write_map
 from avtorch.pedals.fit_map import HeldOut, PedalFit, fit_pedals
-from avtorch.pedals.pedal_drive import PedalCommand
 from avtorch.pedals.pedal_map import PedalMap, PedalTable
 
 __all__ = [
     "HeldOut",
     "MapTable",
-    "PedalCommand",
     "PedalFit",
     "PedalMap",
     "PedalTable",
     "accel_table",
     "brake_table",
     "fit_pedals",
-    "read_map",
     "write_map",
 ]

@@ -1,6 +1,6 @@
 """A map of pedals as files: whole, and as the tables of acceleration that vehicle interfaces take.
 
-- `pedal_map.csv`: everything, a row a knot; `read_map` reads it.
+- `pedal_map.csv`: everything, a row a knot.
 - `accel_map.csv` and `brake_map.csv`, in the layout of Autoware's `raw_vehicle_cmd_converter`: speeds [m/s] in the
   first row behind `default`, pedals from 0 to 1 in the first column, accelerations [m/s²].
 
@@ -18,18 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.errors import InputError
 from avtorch.io import atomic
-from avtorch.io.tables import Table, read_table
-from avtorch.pedals.pedal_map import ERROR, RATE, PedalMap, PedalTable, unit_of
+from avtorch.pedals.pedal_map import PedalMap, PedalTable, unit_of
 
 MAP_FILE, ACCEL_FILE, BRAKE_FILE = "pedal_map.csv", "accel_map.csv", "brake_map.csv"
 _LAST_DIGIT = 0.001  # of an acceleration in a table, m/s²
 _DRIVING = ("throttle", "torque", "current")
-_HEADER = ("pedal", "value", "speed", "accel", "sd")
-_NUMBER = {"coasting": 0, "throttle": 1, "brake": 2, "torque": 3, "current": 4, ERROR: 7, RATE: 8}
-_LAG, _DELAY, _DRIVEN = 5, 6, 9
-"""Which quantity a row is of; numbers, so that the file is a table like others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,11 +136,11 @@ def write_map(made: PedalMap, folder: str | PathLike[str]) -> list[Path]:
 
     Example:
         >>> import numpy as np
-        >>> from avtorch.pedals import PedalMap, PedalTable, read_map, write_map
+        >>> from avtorch.pedals import PedalMap, PedalTable, write_map
         >>> brake = PedalTable(np.array([0.0, 1.0]), np.array([[0, 0], [-6.0, -7.0]]))
         >>> made = PedalMap(np.array([0.0, 30.0]), np.array([0.0, -0.6]), {"brake": brake}, T_L=0.2)
-        >>> [path.name for path in write_map(made, "out")], read_map("out/pedal_map.csv").T_L
-        (['pedal_map.csv', 'brake_map.csv'], 0.2)
+        >>> [path.name for path in write_map(made, "out")]
+        ['pedal_map.csv', 'brake_map.csv']
     """
     texts = {MAP_FILE: _text(made)}
     for name, table in ((ACCEL_FILE, accel_table(made)), (BRAKE_FILE, brake_table(made))):
@@ -160,62 +154,21 @@ def write_map(made: PedalMap, folder: str | PathLike[str]) -> list[Path]:
 
 
 def _text(made: PedalMap) -> str:
-    words = ", ".join(f"{number} {name}" for name, number in _NUMBER.items())
-    words += f", {_LAG} lag [s], {_DELAY} delay [s], {_DRIVEN} speeds driven [m/s], lowest as value, highest as speed"
-    lines = [f"# pedal: {words}; value in {_units(made)}; speed [m/s]; accel and sd [m/s2]", ",".join(_HEADER)]
+    units = ", ".join(f"{unit_of(name, np.abs(table.pedal).max())} ({name})" for name, table in made.pedals.items())
+    words = "lag and delay [s] as value; speeds driven [m/s], lowest as value, highest as speed"
+    lines = [
+        f"# pedal by name, its value in {units}; speed [m/s]; accel and sd [m/s2]; {words}",
+        "pedal,value,speed,accel,sd",
+    ]
     sd = None if made.coasting_sd is None else made.coasting_sd[None]
     tables = {"coasting": PedalTable(np.zeros(1), made.coasting[None], sd), **made.pedals}
     for name, table in tables.items():
         sd = np.zeros_like(table.accel) if table.sd is None else table.sd
         for x, accels, errors in zip(table.pedal.tolist(), table.accel.tolist(), sd.tolist(), strict=True):
             for v, a, e in zip(made.speed.tolist(), accels, errors, strict=True):
-                lines.append(f"{_NUMBER[name]},{x!r},{v!r},{a!r},{e!r}")
-    for number, seconds in ((_LAG, made.T_L), (_DELAY, made.dead_time)):
-        lines.append(f"{number},{float(seconds)!r},0,0,0")
+                lines.append(f"{name},{x!r},{v!r},{a!r},{e!r}")
+    more = {"lag": (made.T_L, 0.0), "delay": (made.dead_time, 0.0)}
     if made.driven is not None:
-        lines.append(f"{_DRIVEN},{float(made.driven[0])!r},{float(made.driven[1])!r},0,0")
+        more["driven"] = made.driven
+    lines += [f"{name},{float(value):.9g},{speed:.9g},0,0" for name, (value, speed) in more.items()]
     return "\n".join(lines) + "\n"
-
-
-def _units(made: PedalMap) -> str:
-    return ", ".join(f"{unit_of(name, np.abs(table.pedal).max())} ({name})" for name, table in made.pedals.items())
-
-
-def read_map(path: str | PathLike[str]) -> PedalMap:
-    """A map from its `pedal_map.csv`.
-
-    Raises `InputError` for any other file, and for a table whose knots do not rise or that is not monotone.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch.pedals import PedalMap, PedalTable, read_map, write_map
-        >>> brake = PedalTable(np.array([0.0, 1.0]), np.array([[0, 0], [-6.0, -7.0]]))
-        >>> made = PedalMap(np.array([0.0, 30.0]), np.array([0.0, -0.6]), {"brake": brake}, T_L=0.2)
-        >>> read_map(write_map(made, "out")[0]).pedals["brake"].accel.tolist()
-        [[0.0, 0.0], [-6.0, -7.0]]
-    """
-    table = read_table(path)
-    kind, value, speed, accel, sd = (table.numbers(name) for name in _HEADER)
-    at = np.unique(speed[kind == 0])
-    found: dict[str, PedalTable] = {}
-    for name, number in _NUMBER.items():
-        rows = kind == number
-        if not rows.any():
-            continue
-        knots = np.unique(value[rows])
-        if not np.array_equal(speed[rows], np.tile(at, len(knots))):
-            raise _unfit(table, name)
-        shape = len(knots), len(at)
-        found[name] = PedalTable(knots, accel[rows].reshape(shape), sd[rows].reshape(shape))
-    if "coasting" not in found or any((kind == number).sum() != 1 for number in (_LAG, _DELAY)):
-        raise _unfit(table, "coasting, lag or delay")
-    coasting = found.pop("coasting")
-    T_L, dead_time = (float(value[kind == number][0]) for number in (_LAG, _DELAY))
-    assert coasting.sd is not None
-    row = kind == _DRIVEN
-    driven = (float(value[row][0]), float(speed[row][0])) if row.any() else None
-    return PedalMap(at, coasting.accel[0], found, T_L, dead_time, coasting.sd[0], driven)
-
-
-def _unfit(table: Table, name: str) -> InputError:
-    return InputError(f"{table.source}: found no full table of {name}, needs the {MAP_FILE} that avtorch writes")

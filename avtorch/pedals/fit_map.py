@@ -26,7 +26,6 @@ from avtorch.gap.result.free_form import (
     SIZES,
     Car,
     Fit,
-    FreeForm,
     LeftOut,
     Prior,
     Products,
@@ -39,8 +38,6 @@ from avtorch.gap.result.free_form import (
 )
 from avtorch.gap.result.free_form import drive as drive_runs
 from avtorch.gap.result.output_error import Coefficients, Rows
-from avtorch.gap.simulator.effect import delay_effect
-from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import LogSource
 from avtorch.pedals.pedal_drive import PedalDrive
 from avtorch.pedals.pedal_map import RATE, SIGN, PedalMap, PedalTable
@@ -99,8 +96,7 @@ class PedalFit:
     """A fitted map with what is known of its errors.
 
     Standard errors [s] of the lag of `map`, of its dead time and of their sum, which is known far better than its
-    parts. `held_out`: how well it foretells blocks left out; `plant`: the map as a plant of the command of
-    `PedalCommand`, None of a commanded speed.
+    parts. `held_out`: how well it foretells blocks left out.
     """
 
     map: PedalMap
@@ -108,7 +104,6 @@ class PedalFit:
     dead_time_sd: float
     late_sd: float
     held_out: HeldOut
-    plant: GapPlant | None
 
 
 def fit_pedals(logs: LogSource | Sequence[LogSource]) -> PedalFit:
@@ -143,7 +138,6 @@ def fit_pedals(logs: LogSource | Sequence[LogSource]) -> PedalFit:
     over = squares_of(Fit(factor.car, factor.x, cut=True), Prior(factor.car, FACTOR), left, independent)
     dead_time, first = _with_dead_time(drive, _FIRST, independent, kept)
     _, sizes, fit = best_form(first.car, left, over, independent, _SIZES)
-    car = None if drive.is_loop else _plant_of(fit, dead_time)
     made = _map_of(drive, fit, dead_time)
     rough = Sizes(max(sizes.resistance, _FIRST.resistance), max(sizes.table, _FIRST.table))  # smoothing is no knowledge
     changes = _changes(drive, fit, Prior(fit.car, rough), dead_time, independent)
@@ -151,16 +145,7 @@ def fit_pedals(logs: LogSource | Sequence[LogSource]) -> PedalFit:
     lag, late = made.T_L * changes[:, -2], changes[:, -1]
     T_L_sd, dead_time_sd, late_sd = (float(np.sqrt((x**2).sum())) for x in (lag, late, lag + late))
     made = _with_errors(made, drive, fit, changes[:, :-1])
-    return PedalFit(made, T_L_sd, dead_time_sd, late_sd, score, car)
-
-
-def _plant_of(fit: Fit, dead_time: float) -> GapPlant:
-    rows, x = fit.car.rows, fit.x
-    at, T_L = Coefficients.of(x[:-1], rows.shape), float(np.exp(x[-1]))
-    kind = delay_effect()
-    late = [kind.of({str(kind.shift): dead_time})] if dead_time > 0 else []
-    forms = FreeForm(rows.knots_u, rows.knots_v, at, _FIRST, T_L).effects()
-    return plant([*late, *forms], T_L=T_L, K_L=1.0 + at.gain, sigma=0.0)
+    return PedalFit(made, T_L_sd, dead_time_sd, late_sd, score)
 
 
 def _map_of(drive: PedalDrive, fit: Fit, dead_time: float) -> PedalMap:

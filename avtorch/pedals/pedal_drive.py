@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -146,39 +146,3 @@ def _averaged(edges: FloatArray, time: FloatArray, values: FloatArray) -> FloatA
     """Means (step,) of what is held from row to row."""
     summed = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(time))])
     return np.diff(np.interp(edges, time, summed)) / np.diff(edges)
-
-
-@dataclass(frozen=True, eq=False)
-class PedalCommand:
-    """One command of all pedals, the sum of s_k f_k p_k with constants f [m/s² a unit] (`factors`), s = -1 for a brake.
-
-    Example:
-        >>> import numpy as np
-        >>> from avtorch import Log
-        >>> from avtorch.pedals import PedalCommand
-        >>> time = np.arange(0.0, 10.0, 0.1)
-        >>> log = Log.from_arrays(time=time, throttle=np.full(100, 0.2), brake=np.zeros(100), speed=10 + np.sin(time))
-        >>> PedalCommand({"throttle": 5.0, "brake": 8.0}).commanded(log).accel_cmd[0].item()
-        1.0
-    """
-
-    factors: Mapping[str, float]
-
-    @classmethod
-    def of(cls, logs: LogSource | Sequence[LogSource]) -> PedalCommand:
-        """The constants that tell most of the acceleration, those of `fit_pedals`. Raises `InputError` for logs without
-        a pedal that moves, or without speed."""
-        drive = PedalDrive.of(logs)
-        if drive.is_loop:
-            raise InputError("logs: found a commanded speed and no pedals, needs pedals for a command of them")
-        return cls(drive.factors)
-
-    def commanded(self, log: Log) -> Log:
-        """The drive with the command of its pedals as `accel_cmd` (row,), which `PedalFit.plant` takes.
-
-        Raises `InputError` for a log that lacks a pedal.
-        """
-        out = np.zeros(log.rows)
-        for name, values in inputs_of(log, self.factors).items():
-            out += SIGN[name] * self.factors[name] * values
-        return replace(log, accel_cmd=out)

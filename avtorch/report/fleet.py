@@ -151,10 +151,6 @@ def _whose(answer: Answer) -> list[str]:
         names = [one["name"] for one in causes if one["verdict"] == verdict]
         if names:
             found.append(words.format(", ".join(names)))
-    for one in causes:
-        for name, of in one.get("parameters", {}).items():
-            if not of["converged"]:
-                found.append(f"How far {one['name']} differs in {name} is not to be relied on: {of['why']}.")
     if not causes:
         found.append("No diagnosis names a cause." if "diagnose" in answer["steps"] else "The logs were not diagnosed.")
     if common is None:
@@ -165,9 +161,6 @@ def _whose(answer: Answer) -> list[str]:
         f"{many(apart, 'car') if apart else 'No car'} of {common['cars']} "
         f"{'differs' if apart <= 1 else 'differ'} from the others in T_L or K_L by more than cars of this model do."
     )
-    for name in ("T_L", "K_L"):
-        if not common[name]["converged"]:
-            found.append(f"The spread of {name} is not to be relied on: {common[name]['why']}.")
     return found
 
 
@@ -208,7 +201,7 @@ def _method(answer: Answer) -> list[str]:
         spread = " The spread between cars includes that between drives." if common["T_L"]["within"] is None else ""
         found.append(
             "Logarithms of T_L and K_L are partially pooled: drives vary about their car, cars about their model, both "
-            f"normally; the spreads are sampled by SGLD over {many(common['sampled_cars'], 'car')}.{spread}"
+            f"normally; the spreads are integrated over a grid.{spread}"
         )
         found.append(
             "A car is unlike its siblings where its drives lie in the tails of what the other cars alone predict, at "

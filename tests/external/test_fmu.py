@@ -175,9 +175,9 @@ def test_a_log_is_read_beside_the_names_of_an_fmu(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("names", "text"),
     [
-        ({"accel_cmd": "steer"}, r"accel_cmd = 'steer': there is no such real variable; candidates: u"),
-        ({"accel_cmd": "a"}, r"accel_cmd = 'a': its causality is output; an input is needed"),
-        ({"speed0": "v"}, r"speed0 = 'v': its causality is output"),
+        ({"accel_cmd": "steer"}, r"accel_cmd = 'steer': needs an input, a real variable; candidates: u"),
+        ({"accel_cmd": "a"}, r"accel_cmd = 'a': needs an input"),
+        ({"speed0": "v"}, r"speed0 = 'v': needs a parameter that can be set"),
         ({"accel": "v", "speed": "v"}, r"variable 'v' is both accel and speed"),
         ({"jerk": "v"}, r"map jerk: not known"),
     ],

@@ -22,7 +22,6 @@ def late(*delays: float, sd: float = 0.01) -> list[dict[str, Any]]:
     return [drive_sizes([cause("dead_time", delay_s=(delay, sd))]) for delay in delays]
 
 
-@pytest.mark.slow
 def test_a_typical_car_its_siblings_and_each_car_are_told_in_seconds() -> None:
     cars = {f"car {i}": late(0.20 + 0.005 * i, 0.205 + 0.005 * i) for i in range(7)}
     common, each = effect_sizes("dead_time", cars)
@@ -36,7 +35,6 @@ def test_a_typical_car_its_siblings_and_each_car_are_told_in_seconds() -> None:
     assert medians == sorted(medians)
     assert medians[0] > 0.2025
     assert medians[-1] < 0.2325
-    assert effect_sizes("dead_time", cars) == (common, each), "the same seed, the same answer"
 
 
 def test_a_drive_that_tells_less_is_drawn_in_more() -> None:
@@ -100,7 +98,7 @@ def test_spreads_are_those_that_cars_and_drives_were_drawn_with(rotating_seed: i
         ("between", between, between / (2 * count) ** 0.5),
         ("within", within, within / (4 * count) ** 0.5),
     ):
-        # 0.02 for the prior's pull and the step of SGLD
+        # 0.02 for the prior's pull
         assert abs(found[name]["median"] - true) < BAR * error + 0.02
     # the coordinate's mean: of the cars, whose own are known to their drives
     mean = float(parameter.unconstrain(torch.tensor(found["typical"]["median"], dtype=torch.float64)))

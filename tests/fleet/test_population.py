@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from scipy import stats
+from torch import Tensor
 
 from avtorch.fleet.folder import drive_belief
-from avtorch.fleet.population import SAMPLED, left_out, population
+from avtorch.fleet.population import MEAN_SD, SPREAD, Pooled, population
 from avtorch.fleet.ranking import APART, car_causes, fleet_causes
-from avtorch.inference import PopulationMargin, sample
 from tests.bars import BAR
 
 F64 = torch.float64
@@ -37,7 +38,6 @@ def test_a_drive_is_known_by_what_its_windows_differ_by_or_by_their_posteriors()
     assert drive_belief([]) is None
 
 
-@pytest.mark.slow
 def test_the_car_that_differs_is_found_and_drawn_in() -> None:
     cars = {f"car {i}": drives_of(*(0.30 + 0.005 * i + 0.003 * k for k in range(2))) for i in range(9)}
     cars["odd"] = drives_of(0.62, 0.6)
@@ -52,7 +52,6 @@ def test_the_car_that_differs_is_found_and_drawn_in() -> None:
     # the other nine have a geometric mean of about 0.32, which the odd one does not move
     assert odd["ratio"] == pytest.approx(odd["pooled"]["median"] / 0.321, rel=0.01)
     assert beside["odd"]["K_L"]["tail"] > 0.1
-    assert population(cars) == (common, beside), "the same seed, the same answer"
 
 
 def test_two_cars_have_no_siblings() -> None:
@@ -66,50 +65,76 @@ def test_without_a_second_drive_of_any_car_its_spread_is_not_told() -> None:
     assert common["T_L"]["between"]["q05"] > 0
 
 
+AXES = [torch.linspace(*ends, n, dtype=F64) for *ends, n in ((-0.8, 0.8, 61), (-5.0, 1.0, 50), (-7.0, 0.5, 45))]
+Z = torch.stack([x.flatten() for x in torch.meshgrid(*AXES, indexing="ij")], -1)
+"""Mean, log between and log within (point,)."""
+
+
+def joint(y: Tensor, sd: Tensor, car: Tensor) -> tuple[Tensor, Tensor]:
+    """Belief in each of `Z`, and the covariance (point, drive, drive), by one normal of all drives and the priors as
+    they stand."""
+    mean, between, within = Z[:, 0], Z[:, 1].exp(), Z[:, 2].exp()
+    shared = (car[:, None] == car).double() * between[:, None, None] ** 2
+    spread = shared + torch.diag_embed(sd**2 + within[:, None] ** 2)
+    said = torch.distributions.MultivariateNormal(mean[:, None].expand(-1, len(y)), spread).log_prob(y)
+    said = said + torch.distributions.Normal(torch.zeros((), dtype=F64), MEAN_SD).log_prob(mean)
+    gamma = torch.distributions.Gamma(torch.full((), 2.0, dtype=F64), 2 / SPREAD)
+    # the Jacobian of a logarithm is the spread itself
+    return (said + sum(gamma.log_prob(x) + x.log() for x in (between, within))).softmax(0), spread
+
+
+def six_cars(seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Estimates, their standard deviations and cars."""
+    g = torch.Generator().manual_seed(seed)
+    car = torch.tensor([0, 0, 1, 1, 2, 3, 4, 5, 5])
+    sd = 0.04 + 0.04 * torch.rand(len(car), generator=g, dtype=F64)
+    return (0.15 * torch.randn(6, generator=g, dtype=F64))[car] + sd * torch.randn(9, generator=g, dtype=F64), sd, car
+
+
 @pytest.mark.statistical
 def test_a_car_left_out_is_predicted_as_if_it_were_not_there(rotating_seed: int) -> None:
-    g = torch.Generator().manual_seed(rotating_seed)
-    car = torch.tensor([0, 0, 1, 1, 2, 2, 3, 4, 5, 5])
-    sd = 0.04 + 0.04 * torch.rand(1, 10, generator=g, dtype=F64)
-    y = (0.15 * torch.randn(6, generator=g, dtype=F64))[car] + sd * torch.randn(1, 10, generator=g, dtype=F64)
-    full = PopulationMargin(y, sd, car)
-    others = PopulationMargin(y[:, 2:], sd[:, 2:], car[2:] - 1)
-    walked = sample(others, generator=g)
-    mean, between, within = (walked.draws[..., 0, i] for i in range(3))
-    own, precision, _ = (x[..., 0] for x in full.of_cars(within[..., None]))
-    below = torch.special.ndtr((own[..., 0] - mean) / (between.square() + 1 / precision[..., 0]).sqrt()).mean(1)
-    others, tail = left_out(full)
-    expected = 2 * float(torch.minimum(below.mean(), 1 - below.mean()))
-    chains = mean.mean(1)
-    # 0.03 SDs of the mean for the step of SGLD
-    assert abs(float(others[0, 0] - chains.mean())) < BAR * float(chains.std()) / len(chains) ** 0.5 + 0.03 * float(
-        mean.std()
-    )
-    # 0.02 for the step of SGLD
-    assert abs(float(tail[0, 0]) - expected) < BAR * 2 * float(below.std()) / len(below) ** 0.5 + 0.02
+    y, sd, car = six_cars(rotating_seed)
+    weight, _ = joint(y[2:], sd[2:], car[2:])
+    precision = 1 / (sd[:2] ** 2 + Z[:, 2:].exp() ** 2)
+    own = (precision * y[:2]).sum(1) / precision.sum(1)
+    below = float(weight @ torch.special.ndtr((own - Z[:, 0]) / (Z[:, 1].exp() ** 2 + 1 / precision.sum(1)).sqrt()))
+    others, tail = Pooled(y, sd, car).siblings()
+    assert float(others[0]) == pytest.approx(float(weight @ Z[:, 0]), abs=2e-3)
+    assert float(tail[0]) == pytest.approx(2 * min(below, 1 - below), abs=5e-3)
+
+
+@pytest.mark.statistical
+def test_the_belief_on_the_grid_is_that_of_the_model(rotating_seed: int) -> None:
+    y, sd, car = six_cars(rotating_seed)
+    weight, spread = joint(y, sd, car)
+    found = Pooled(y, sd, car)
+    spreads = found.spreads()
+    told = [found.typical(), *(np.log([*spreads[name].values()]) for name in ("between", "within"))]
+    for i, (axis, ends) in enumerate(zip(AXES, told, strict=True)):
+        own = weight.reshape(61, 50, 45).sum([k for k in range(3) if k != i])
+        below = np.interp(ends, axis, own.cumsum(0) - 0.5 * own)
+        assert below == pytest.approx([0.5, 0.05, 0.95], abs=0.01)
+    # each car by the normal law of all drives and itself
+    with_car = (car == torch.arange(6)[:, None]).double() * Z[:, 1].exp()[:, None, None] ** 2
+    gain = torch.linalg.solve(spread, with_car.transpose(1, 2)).transpose(1, 2)
+    mean = Z[:, :1] + (gain @ (y - Z[:, :1])[..., None])[..., 0]
+    variance = Z[:, 1:2].exp() ** 2 - (gain * with_car).sum(-1)
+    first, second = weight @ mean, weight @ (variance + mean.square())
+    means, sds = found.each_car()
+    assert torch.allclose(means, first, atol=1e-3)
+    assert torch.allclose(sds, (second - first.square()).sqrt(), rtol=5e-3)
 
 
 @pytest.mark.statistical
 def test_tails_of_alike_cars_are_uniform(rotating_seed: int) -> None:
     g = torch.Generator().manual_seed(rotating_seed)
     count = 1500
-    sd = torch.full((1, count), 0.05, dtype=F64)
-    y = torch.randn(1, count, generator=g, dtype=F64) * math.hypot(0.1, 0.05) - 1
-    found = left_out(PopulationMargin(y, sd, torch.arange(count)))[1][0]
+    sd = torch.full((count,), 0.05, dtype=F64)
+    y = torch.randn(count, generator=g, dtype=F64) * math.hypot(0.1, 0.05) - 1
+    found = Pooled(y, sd, torch.arange(count)).siblings()[1]
     for level in (0.02, 0.1, 0.5):
         error = (level * (1 - level) / count) ** 0.5
         assert abs(float((found < level).double().mean()) - level) < BAR * error
-
-
-@pytest.mark.slow
-def test_of_a_large_fleet_some_cars_tell_the_spread_and_all_are_compared() -> None:
-    g = torch.Generator().manual_seed(0)
-    lags = (0.1 * torch.randn(3 * SAMPLED, generator=g) - 1).exp().tolist()
-    common, beside = population({str(i): drives_of(lag, sd=0.02) for i, lag in enumerate(lags)})
-    assert common is not None
-    assert (common["cars"], common["sampled_cars"], len(beside)) == (3 * SAMPLED, SAMPLED, 3 * SAMPLED)
-    # 0.1 and the drives' own spread, to 5 % by 200 cars, which are five standard errors here
-    assert common["T_L"]["between"]["median"] == pytest.approx(0.1, rel=0.25)
 
 
 def test_causes_are_the_model_s_or_single_cars_by_the_share_of_cars() -> None:

@@ -51,12 +51,12 @@ def test_law_lag_and_delay_are_found(name: str, rotating_seed: int) -> None:
 
 
 def truth_names(found: FollowerDiagnosis) -> list[str]:
-    return [c.key for c in found.identified.candidate.coordinates]
+    return list(found.identified.candidate.coordinates)
 
 
 def drawn_z(found: FollowerDiagnosis) -> np.ndarray:
     each = found.identified.candidate.coordinates
-    return np.stack([(c.parameter.unconstrain(torch.as_tensor(found.draws[c.key])) / c.wider).numpy() for c in each], 1)
+    return np.stack([p.unconstrain(torch.as_tensor(found.draws[key])).numpy() for key, p in each.items()], 1)
 
 
 @pytest.mark.statistical

@@ -13,7 +13,6 @@ from avtorch.inference import (
     JerkDensity,
     JerkPoints,
     JerkStatistics,
-    PopulationMargin,
 )
 from avtorch.inference.latent import LatentDensity, LatentWindow
 from avtorch.inference.priors import (
@@ -70,11 +69,6 @@ def latent_density(device: Any, jitter: float = 0.0) -> LatentDensity:
     return LatentDensity(data.to(device))
 
 
-def margin(device: Any) -> PopulationMargin:
-    lag = torch.tensor([[0.30, 0.32, 0.31, 0.33, 0.60]], dtype=F64).log()
-    return PopulationMargin(*(x.to(device) for x in (lag, torch.full_like(lag, 0.02), torch.arange(5))))
-
-
 def own(device: Any) -> TorchDensity:
     shape, rate = (torch.tensor(x, dtype=F64).to(device) for x in (9.0, 3.0))
     return TorchDensity(
@@ -89,7 +83,6 @@ DENSITIES: dict[str, Callable[[Any], Any]] = {
     "points": jerk_points,
     "even rows": latent_density,
     "uneven rows": lambda d: latent_density(d, 0.008),
-    "margin": margin,
     "own": own,
 }
 

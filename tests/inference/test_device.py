@@ -101,7 +101,6 @@ def test_densities_and_modes(name: str, elsewhere: OtherDevice) -> None:
     [
         ("jerk, switch", "averaged"),
         pytest.param("points", "independent", marks=pytest.mark.slow),
-        pytest.param("margin", "averaged", marks=pytest.mark.slow),
         pytest.param("own", "averaged", marks=pytest.mark.slow),
     ],
 )

@@ -1,14 +1,12 @@
-"""The map itself, refused where it turns back, and beside the plant of its fit."""
+"""The map itself, refused where it turns back."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from avtorch.errors import InputError
-from avtorch.gap import ForceTable, ResistanceCurve
-from avtorch.pedals import PedalCommand, PedalMap, PedalTable, fit_pedals
+from avtorch.pedals import PedalMap, PedalTable
 from tests.pedals.cars import drive, plain
 
 
@@ -41,21 +39,3 @@ def test_tables_that_are_no_map(knots: list, accel: list, told: str) -> None:
         PedalMap(np.array([0.0, 30.0]), np.zeros(2), {"throttle": PedalTable(np.array(knots), np.array(accel))})
     with pytest.raises(InputError, match="needs some of throttle, brake, torque, current"):
         PedalMap(np.array([0.0, 30.0]), np.zeros(2), {})
-
-
-def test_the_map_and_the_plant_of_a_fit_are_the_same() -> None:
-    log = drive(plain, 2, seconds=60.0)
-    fit = fit_pedals(log)
-    assert fit.plant is not None
-    table, curve = (next(e for e in fit.plant.effects if isinstance(e, kind)) for kind in (ForceTable, ResistanceCurve))
-    command, speed = PedalCommand.of(log).commanded(log).accel_cmd, log.speed
-    assert command is not None
-    assert speed is not None
-    u, v = torch.as_tensor(command), torch.as_tensor(speed)
-    whole = fit.plant.K_L * u + table.force(u, v) + curve.force(v)
-    mapped = fit.map.commanded(log).accel_cmd
-    assert mapped is not None
-    # the plant's numbers have six digits; where the force turns back, the map is between its two monotone ones
-    off = np.abs(mapped - whole.numpy())
-    assert np.median(off) < 1e-5
-    assert off.max() < 0.05
