@@ -19,7 +19,7 @@ ALLOWED = {
     "gap/result": "what chance decides, and the delay beside T_L, have places of their own in an answer",
     "gap/diagnose.py": "lost messages are of the link, not of the car",
     "experiment/prediction.py": "what is unknown along a road is integrated out",
-    "remedy/what_to_set.py": "a road is no part of a loop",
+    "gap/linearised.py": "a road is no part of a loop",
     "gap/__init__.py": "offers the classes to the user by name",
     "cli/estimate.py": "the dead time is an argument of the estimators, no effect",
     "cli/stability.py": "the dead time is an argument of the stability functions, no effect",

@@ -94,13 +94,13 @@ def replay(
     link_delay: float = 0.0,
     dt: float = 0.05,
 ) -> Performance:
-    """Performance (scenario, candidate) of `setting` (scenario, candidate) through `history`, with the vehicle T_L [s],
-    K_L [-] (scenario,).
+    """Performance (scenario, candidate) of `setting` through `history`.
 
-    The time gap leaves `time_gap_now` (scenario,) after `delay` [s] at `ramp_rate` [s/s]; the leader's acceleration is
-    received `link_delay` [s] late. Limits [m/s²] are numbers or (scenario,). The step is the logged one or a multiple
-    of it, at most `dt` [s] and a sixth of the lag: holding a command for longer would make a fast car with a strong k_a
-    oscillate, unlike the real loop.
+    `setting` (scenario, candidate), of a vehicle `T_L` [s], `K_L` [-] (scenario,). The time gap leaves `time_gap_now`
+    (scenario,) after `delay` [s] at `ramp_rate` [s/s]; the leader's acceleration is received `link_delay` [s] late.
+    Limits [m/s²] are numbers or (scenario,). The step is the logged one or a multiple of it, at most `dt` [s] and a
+    sixth of the lag: holding a command for longer would make a fast car with a strong k_a oscillate, unlike the real
+    loop.
     """
     strides = (torch.clamp_max(T_L / 6.0, dt) / history.dt + 1e-9).long().clamp(1, history.lead_speed.shape[1] - 1)
     out: Performance | None = None

@@ -222,7 +222,7 @@ def test_json_and_quiet(search: Search, drive: str, tmp_path: Path, capsys: pyte
         (["--prior", "none=1", "--prior", "none=2"], "--prior: found none twice"),
         (["--baseline", "nonsense"], "--baseline 'nonsense': effect: found 'nonsense'"),
         (["--baseline", "dead_tim=0.2"], "found 'dead_tim', needs an effect's name; perhaps dead_time"),
-        (["--baseline", "dead_time=x"], "needs a number after '='"),
+        (["--baseline", "dead_time=x"], "needs effects, each once, with numbers"),
         (["--baseline", "dead_time=-0.1"], "dead_time.delay_s is -0.1, needs a number"),
         (["--baseline", "T_L=0"], "--baseline 'T_L=0': T_L"),
         (["--baseline", "missing.toml"], "--baseline 'missing.toml': no such file"),
