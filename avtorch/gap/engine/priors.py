@@ -17,8 +17,8 @@ EFFECT_NATS_ALONE = 6.0
 in."""
 SLOW_FORCE_NATS = 7.0
 """The same for a slow random force (gust, road) [nats]: any drive meets some wind and slope."""
-UNKNOWN_NATS = 12.0
-"""The same for a free form in place of a name [nats]: slightly rarer than a named effect."""
+UNKNOWN_NATS = 14.0
+"""The same for a free form in place of a name [nats]: ten forms at exp(-3.5) each are a sixth of what 25 names have."""
 OUTLIER_NATS = 18.0
 """The same for outliers [nats]: tails compare the best of many laws."""
 TRIED_NATS = 3.2
