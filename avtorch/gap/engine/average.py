@@ -288,8 +288,8 @@ def _given(label: str, prior: Mapping[str, float]) -> float:
 
 
 def _acts(h: Hypothesis) -> bool:
-    """Whether no effect of the set stands at nothing."""
-    return all(EFFECTS[e].size(h.values, h.neutral) > 0.1 for e in h.effects)
+    """Whether no effect of the set is too faint for a name: beside nothing, a free form is none of its kind."""
+    return all(e.startswith("~") or EFFECTS[e].size(h.values, h.neutral) > 1 for e in h.effects)
 
 
 def _from_the_start(h: Hypothesis) -> np.ndarray:
@@ -374,9 +374,8 @@ def _set_in(c: Composition, late: Mapping[str, SlowOnset]) -> Composition:
 
 def _weights(x: Examined, examined: list[Examined]) -> Iterator[Weight]:
     h = x.hypothesis
-    named = [e for e in h.effects if not e.startswith("~") and EFFECTS[e].size(h.values, h.neutral) > 1]
-    names = sorted({base_name(e) for e in named})
-    count = sum(not e.startswith("~") for e in h.effects)
+    named = [e for e in h.effects if not e.startswith("~")]
+    names, count = sorted({base_name(e) for e in named}), len(named)
     each = EFFECT_NATS_ALONE if h.alone else EFFECT_NATS
     odds = -each * count - (UNKNOWN_NATS if h.force is not None else 0.0)
     # outliers that other sets explain are none: more effects may not make more of them

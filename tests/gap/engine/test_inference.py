@@ -259,6 +259,16 @@ def test_a_slow_force_that_nobody_asked_for_is_noise() -> None:
     assert not {"gust", "road_grade", "outliers"} & {n for label in found.probabilities for n in label.split("+")}
 
 
+def test_nothing_stands_beside_an_effect_that_is_too_faint_for_a_name() -> None:
+    """A free form beside nothing was once `unknown` on a car without a cause, at 270 nats."""
+    found = infer(DriveData.of(recorded_log(seconds=60.0, seed=5)))
+    faint = [
+        h for h in found.search.visited.values() if any(EFFECTS[e].size(h.values, h.neutral) <= 1 for e in h.effects)
+    ]
+    assert faint
+    assert not [x for x in found.average.examined if x.hypothesis in faint]
+
+
 @pytest.mark.parametrize("seed", [2, 3])
 def test_twenty_seconds_of_speed_alone_are_answered(seed: int) -> None:
     """Fewer coefficients than a linear bank has signals."""
