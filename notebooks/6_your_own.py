@@ -88,9 +88,8 @@ for what, answer in (("this minute", quiet), ("a livelier one", without)):
     print(f"without the class, {what}:", answer.verdict.name, f"{answer.winner.probability:.2f}")
 
 # %% [markdown]
-# With the class among the hypotheses the diagnosis names the effect and its size. Without it it cannot. In this minute
-# it says so: the verdict is `unknown`, a cause that is not in the table. In a livelier one of the same car it blames
-# the road, which is wrong: what a table lacks can look like what it has.
+# With the class among the hypotheses the diagnosis names the effect and its size. Without it it cannot, and says so, in
+# this minute and in a livelier one of the same car: the verdict is `unknown`, a cause that is not in the table.
 #
 # `@register` above the class would make it available everywhere: in strings, in TOML files, in every diagnosis.
 #

@@ -129,7 +129,7 @@ def your_own(names: Names) -> None:
     assert names["error"] == 0.0
     assert names["found"].verdict.name == "pedal_map"
     assert names["quiet"].verdict.name == "unknown"
-    assert names["without"].verdict.name == "road_grade"
+    assert names["without"].verdict.name == "unknown"
     peaks = [
         names["avtorch"].stability.peak_gain(T, K, names["time_gap"], names["gains"]) for T, K in ((0.3, 1), (1.5, 0.5))
     ]

@@ -36,5 +36,5 @@ def test_commands_print_what_the_page_shows(
             assert program != "avtorch" or main(tokens) == 0, line
         printed = capsys.readouterr().out
         if "now, " in printed:
-            assert "1.18 now, 1.00 as advised" in printed  # as the sentence below that block says
+            assert "1.18 now, 1.02 as advised" in printed  # as the sentence below that block says
     assert compared == 5

@@ -225,7 +225,7 @@ def test_an_interrupted_run_is_resumed(tmp_path: Path, capsys: pytest.CaptureFix
                 os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == 130
     assert told.splitlines()[-1:] == [
-        f"avtorch: interrupted; finished rows are kept in {out}: the same command does what is missing"
+        f"avtorch: interrupted: finished rows are kept in {out}: the same command does what is missing"
     ]
     assert "Traceback" not in told
     assert not [p for p in out.rglob("*") if p.suffix == ".part"]

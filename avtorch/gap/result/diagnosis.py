@@ -77,7 +77,7 @@ class Diagnosis(Displayed, Findings):
         >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.05), plant=late).log()
         >>> found = diagnose(log, effects=["dead_time"], pairs=False)
         >>> print(str(found).split(". ")[0].splitlines()[0])
-        The simulator lacks this (probability 0.99): commands act 0.39 s late (dead_time).
+        The simulator lacks this (probability over 0.99): commands act 0.39 s late (dead_time).
         >>> [path.name for path in found.write("out")]
         ['diagnosis.json', 'plant.toml']
     """
