@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from avtorch.arrays import FloatArray
 from avtorch.gap.engine.free_forms import FreeFormFit, demand_response
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import claim_bands, log_sum
 from avtorch.gap.engine.priors import CLAIM_HZ
 from avtorch.gap.engine.shape_error import frame_energy, noise_beside
+from avtorch.gap.engine.slow_forces import expected_force
 
 SIZES = (0.0, 0.03, 0.06, 0.12, 0.24, 0.48)
 """Root mean square of the force over that of the demand [-]: doublings up to a half."""
@@ -48,18 +48,6 @@ def roughness(h: Hypothesis, form: str) -> FreeFormFit:
     noise = covariances[best, np.arange(bands)]
     return FreeFormFit(
         float(sum(log_sum(list(band)) for band in each.T)),
-        h.residual - _expected(h, size**2 * force[..., 0, 0], noise),
+        h.residual - expected_force(data, h.residual, size**2 * force[..., 0, 0], noise),
         size,
     )
-
-
-def _expected(h: Hypothesis, power: FloatArray, noise: FloatArray) -> FloatArray:
-    """Mean of a force common to both channels, of `power` (frame, band) beside `noise` (band, channel, channel), given
-    the residual: P 1 1' (P 1 1' + S)^-1 r, in the shape of that."""
-    edges = h.data.band_edges[: power.shape[1] + 1]
-    V = power[..., None, None] + noise
-    weight = power[..., None] * np.linalg.solve(V, np.ones((*power.shape, 2, 1)))[..., 0]  # frame, band, channel
-    out = np.zeros_like(h.residual)
-    low = h.residual[:, :, : edges[-1]]
-    out[:, :, : edges[-1]] = np.einsum("fbc,cfb->fb", np.repeat(weight, np.diff(edges), axis=1), low)
-    return out

@@ -355,22 +355,31 @@ def slow_forces(
 
 
 def cycle_response(data: DriveData, residual: FloatArray, found: SlowForces) -> FloatArray:
-    """What a cycle is expected to have done, given a `residual` (channel, frame, bin) of two channels; the same shape.
-
-    The mean of a Gaussian of power P beside noise of the covariance V: P 1 1' V^-1 r.
-    """
+    """What a cycle is expected to have done, given the `residual` (channel, frame, bin) of two channels; its shape."""
     frequency, energy = data.band_response
     power = found.cycle_sd**2 * (cycle_spectrum(frequency, found.cycle_hz) @ energy.T)
     process = found.process_power * (found.process_noise_beside_cycle / found.process_noise_beside_gust) ** 2
     variances = wishart_profile(found.covariance, found.counts, power + process)[1]
-    V = (power + process)[:, None, None] + np.eye(2) * variances[:, None]
     scale = np.sqrt(np.diagonal(found.sensor, axis1=1, axis2=2))  # (band, channel)
-    weights = power[:, None] * np.linalg.solve(V, np.ones((found.bands, 2, 1)))[..., 0] * scale
+    scale = np.repeat(scale, np.diff(data.band_edges[: found.bands + 1]), axis=0).T[:, None]
+    before = residual[:, :, : scale.shape[-1]] * scale
+    noise = process[:, None, None] + np.eye(2) * variances[:, None]
     out = np.zeros_like(residual)
-    edges = data.band_edges[: found.bands + 1]
-    weight, scale = (np.repeat(x, np.diff(edges), axis=0) for x in (weights, scale))
-    common = np.einsum("bc,cfb->fb", weight, residual[:, :, : edges[-1]])
-    out[:, :, : edges[-1]] = common / scale.T[:, None]
+    out[:, :, : scale.shape[-1]] = expected_force(data, before, power[None], noise) / scale
+    return out
+
+
+def expected_force(data: DriveData, residual: FloatArray, power: FloatArray, noise: FloatArray) -> FloatArray:
+    """Mean of a Gaussian force common to two channels, given a `residual` (channel, frame, bin); the same shape.
+
+    `power` (frame or 1, band) in the lowest bands, beside `noise` (band, channel, channel): P 1 1' (P 1 1' + S)^-1 r.
+    """
+    edges = data.band_edges[: power.shape[1] + 1]
+    V = power[..., None, None] + noise
+    weight = power[..., None] * np.linalg.solve(V, np.ones((*power.shape, 2, 1)))[..., 0]  # frame, band, channel
+    weight = np.broadcast_to(np.repeat(weight, np.diff(edges), axis=1), (residual.shape[1], edges[-1], 2))
+    out = np.zeros_like(residual)
+    out[:, :, : edges[-1]] = np.einsum("fbc,cfb->fb", weight, residual[:, :, : edges[-1]])
     return out
 
 

@@ -260,7 +260,7 @@ def test_a_slow_force_that_nobody_asked_for_is_noise() -> None:
 
 
 def test_nothing_stands_beside_an_effect_that_is_too_faint_for_a_name() -> None:
-    """A free form beside nothing was once `unknown` on a car without a cause, at 270 nats."""
+    """A free form beside nothing was once `unknown` on a car without a cause, at 270 nats. Three stood here."""
     found = infer(DriveData.of(recorded_log(seconds=60.0, seed=5)))
     faint = [
         h for h in found.search.visited.values() if any(EFFECTS[e].size(h.values, h.neutral) <= 1 for e in h.effects)
