@@ -194,6 +194,7 @@ def examine(h: Hypothesis, search: Search) -> Examined:
         if rest.effect_energy is not None:
             size = relative_size(data, h.covariance, h.predicted - rest.predicted, rest.effect_energy)
         beside[base_name(e)] = (min(size, 99.0), h.evidence - rest.evidence)
+    h.jacobian = None
     outliers = sensor_outliers(h) if data.accel is not None else None
     return Examined(h, tuple(c for c in compositions if c is not None), outliers, beside, mirror)
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.engine.coordinates import COORDINATES, EFFECTS, INDEX
-from avtorch.gap.engine.gauss_newton import linearised, normal_prior, whitened_under_noise
+from avtorch.gap.engine.gauss_newton import linear_priors, normal_prior, slopes_of, whitened_under_noise
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import HALF_LOG_2PI, claimed, freedom, log_sum
 from avtorch.gap.engine.priors import LOST_NATS, ONSET_ODDS, SHIFT_NATS, TRIED_NATS
@@ -65,8 +65,9 @@ def evaluate_evidence(h: Hypothesis) -> Hypothesis:
     """
     base = h.base or h
     names = h.free
-    h.jacobian, precision, _ = linearised(h, names)
-    W = whitened_under_noise(h, h.jacobian, precision, _ROUNDS)
+    h.jacobian = None
+    slopes, (precision, _) = slopes_of(h), linear_priors(h, names)
+    W = whitened_under_noise(h, slopes, precision, _ROUNDS)
     h.information = W @ W.T + np.diag(precision)
     first = base.plain or base
     first_claimed = claimed(first.data, first.covariance)

@@ -29,7 +29,7 @@ from avtorch.arrays import BoolArray, FloatArray
 from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.force_map import MAP_SIZES, MapForm, map_forms, size_log_prior
-from avtorch.gap.engine.gauss_newton import linear_priors
+from avtorch.gap.engine.gauss_newton import linear_priors, slopes_of
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import claimed, freedom, least_noise, log_likelihood, log_sum, whiten
 from avtorch.gap.engine.priors import ONSET_ODDS
@@ -125,11 +125,12 @@ def mirror_columns(h: Hypothesis) -> FreeForm:
 def block(h: Hypothesis, form: FreeForm) -> FreeFormFit:
     """Evidence of a linear form beside `h`, whose parameters may move again, summed over the form's sizes.
 
-    `h`: with its evidence evaluated (`jacobian`, `information`).
+    `h`: with its evidence evaluated (`information`).
     """
+    slopes = slopes_of(h)
     precision, pull = linear_priors(h, h.free)
-    known = len(h.jacobian)
-    products = band_products(h.data, np.concatenate([h.residual[None], np.asarray(h.jacobian), form.columns]))
+    known = len(slopes)
+    products = band_products(h.data, np.concatenate([h.residual[None], slopes, form.columns]))
     without, _ = linear_evidence(h, products[..., : 1 + known, : 1 + known], precision, pull, 2)
     without = max(without, -0.5 * float(np.linalg.slogdet(h.information)[1]))
     count = len(form.columns)
@@ -145,7 +146,7 @@ def block(h: Hypothesis, form: FreeForm) -> FreeFormFit:
         if nats[-1] == max(nats):
             best, size = moves, sd
     taken = np.tensordot(best[known:], form.columns, 1)
-    over, residual = 0.0, h.residual - taken - np.tensordot(best[:known], h.jacobian, 1)
+    over, residual = 0.0, h.residual - taken - np.tensordot(best[:known], slopes, 1)
     if form.name in _OF_LAGS:
         residual, over = _bent(h, best[:known], taken, residual)
     return FreeFormFit(log_sum(nats) - over, residual, best[known:], size)
@@ -165,7 +166,7 @@ def _bent(h: Hypothesis, moves: FloatArray, taken: FloatArray, linear: FloatArra
     """The residual without what a form has `taken`, simulated anew with the unknowns of `h` at their new values, and
     how many nats more the `linear` residual had promised: a large step in a lag is not linear."""
     count = len(h.free)
-    left = _moved(h, moves[:count]).residual - taken - np.tensordot(moves[count:], h.jacobian[count:], 1)
+    left = _moved(h, moves[:count]).residual - taken - np.tensordot(moves[count:], slopes_of(h)[count:], 1)
     return left, max(log_likelihood(h.data, linear)[0] - log_likelihood(h.data, left)[0], 0.0)
 
 
@@ -331,7 +332,7 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float) -> FreeFormFit:
     What wanders is noise at first; once it is out, the noise is smaller: both are found in turn. The noise is larger in
     frames that still show more of it where the response is, so that one such frame is no wandering.
     """
-    data = h.data
+    data, slopes = h.data, slopes_of(h)
     frames = data.frame_count
     precision, pull = linear_priors(h, h.free)
     between = np.abs(data.frame_time[:, None] - data.frame_time)
@@ -348,10 +349,10 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float) -> FreeFormFit:
         return over + float(pull @ moves - 0.5 * precision @ moves**2), after
 
     # at a crease of the likelihood moved parameters alone gain something, which is not to the course's credit
-    white = np.array([whiten(data, h.covariance, j) for j in h.jacobian])
+    white = np.array([whiten(data, h.covariance, j) for j in slopes])
     score = white @ whiten(data, h.covariance, h.residual) + pull
     alone = np.asarray(np.linalg.solve(white @ white.T + np.diag(precision), score), np.float64)
-    promised = max(gain(alone, h.residual - np.einsum("p,pcfk->cfk", alone, h.jacobian))[0], 0.0)
+    promised = max(gain(alone, h.residual - np.einsum("p,pcfk->cfk", alone, slopes))[0], 0.0)
     noise, left = h.covariance, h.residual
     best, moved = FreeFormFit(-math.inf, None, np.zeros(frames)), alone
     for _ in range(_COURSES):
@@ -359,7 +360,7 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float) -> FreeFormFit:
         energy = (w * w).sum(1)
         scale = np.sqrt(np.maximum((w * w * remaining**2).sum(1) / np.maximum(energy, 1e-12), 1.0))[:, None]
         w, r = w / scale, r / scale
-        jacobian = np.array([by_frame(j, noise) / scale for j in h.jacobian])
+        jacobian = np.array([by_frame(j, noise) / scale for j in slopes])
         shared = np.einsum("fk,pfk->pf", w, jacobian)
         flat = jacobian.reshape(len(jacobian), -1)
         taken = np.linalg.solve(flat @ flat.T + np.diag(precision), np.c_[shared, flat @ r.ravel() + pull])
@@ -367,7 +368,7 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float) -> FreeFormFit:
         score = (w * r).sum(1) - shared.T @ taken[:, -1]
         course, occam = _best_course(score, 0.5 * (information + information.T), priors)
         moves = taken[:, -1] - taken[:, :-1] @ course
-        left = h.residual - response * course[:, None] - np.einsum("p,pcfk->cfk", moves, h.jacobian)
+        left = h.residual - response * course[:, None] - np.einsum("p,pcfk->cfk", moves, slopes)
         over, after = gain(moves, left)
         over += occam - math.log(len(priors)) - promised
         if over > best.nats:

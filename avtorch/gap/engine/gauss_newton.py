@@ -116,6 +116,14 @@ def linearised(h: Hypothesis, names: Sequence[str]) -> tuple[FloatArray, FloatAr
     return slopes, *linear_priors(h, names)
 
 
+def slopes_of(h: Hypothesis) -> FloatArray:
+    """Derivatives (unknown, channel, frame, bin) of `linearised` by what is free. The hypothesis keeps them until its
+    `jacobian` is taken away: of an hour they are larger than all else that is kept of a set."""
+    if h.jacobian is None:
+        h.jacobian = linearised(h, h.free)[0]
+    return h.jacobian
+
+
 def force_columns(h: Hypothesis) -> FloatArray:
     """Derivatives (curve, channel, frame, bin) by the coefficients of the force map, of an evaluated hypothesis.
 

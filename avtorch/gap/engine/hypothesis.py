@@ -71,7 +71,7 @@ class Hypothesis:
     covariance: FloatArray = field(init=False, repr=False)
     log_likelihood: float = field(init=False, default=-np.inf)
 
-    jacobian: FloatArray = field(init=False, repr=False)
+    jacobian: FloatArray | None = field(init=False, default=None, repr=False)
     information: FloatArray = field(init=False, repr=False)
     force_columns: tuple[FloatArray, FloatArray] | None = field(init=False, default=None, repr=False)
     force_spread: FloatArray | None = field(init=False, default=None, repr=False)

@@ -184,7 +184,7 @@ class Search:
         return sum(e != "~linear" for e in h.effects)
 
     def _put(self, h: Hypothesis, anew: bool = False) -> Hypothesis:
-        evaluate_evidence(h if h.base is h else resized(h))
+        evaluate_evidence(h if h.base is h else resized(h)).jacobian = None
         key = self.key(h)
         if anew or key not in self.visited or self.visited[key].score < h.score:
             self.visited[key] = h

@@ -30,7 +30,7 @@ from avtorch.gap.engine.free_forms import (
     sensor_form,
     wandering,
 )
-from avtorch.gap.engine.gauss_newton import fit, jacobian, prior_terms, whitened_jacobian
+from avtorch.gap.engine.gauss_newton import fit, prior_terms, slopes_of, whitened_jacobian
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import log_likelihood, whiten
 from avtorch.gap.engine.roughness import SIGNS, roughness
@@ -111,8 +111,7 @@ def _car(response: Force, channels: tuple[str, ...] = ("accel", "speed"), seed: 
 
 def _fitted(data: DriveData) -> Hypothesis:
     h = fit(Hypothesis(data), 12)
-    h.jacobian = jacobian(h, h.free)
-    whitened = whitened_jacobian(h, h.jacobian)
+    whitened = whitened_jacobian(h, slopes_of(h))
     h.information = whitened @ whitened.T + np.diag(prior_terms(h, h.free)[0])
     return h
 
@@ -192,7 +191,7 @@ def test_what_the_parameters_already_do_gains_nothing() -> None:
     """A form in the span of the Jacobian: its coefficient and the gain's own share what little is left. The gain's sd
     is 0.5; with another 0.35 beside it, the prior is wider, and the posterior as narrow."""
     h = _car(_lags)
-    again = FreeForm("gain", h.jacobian[h.free.index("K_L")][None])
+    again = FreeForm("gain", slopes_of(h)[h.free.index("K_L")][None])
     found = block(h, again)
     wider = 0.5 * math.log(1.0 + (0.35 / 0.5) ** 2)
     assert found.nats == pytest.approx(-wider, abs=0.2)  # what the prior's mean is away from the fit
@@ -205,7 +204,7 @@ def test_residual_is_what_the_coefficients_leave() -> None:
     assert found.residual is not None
     explained = h.residual - found.residual - np.tensordot(found.coefficients, form.columns, 1)
     flat = explained.ravel()
-    basis = h.jacobian.reshape(len(h.jacobian), -1)
+    basis = slopes_of(h).reshape(len(h.free), -1)
     left = flat - basis.T @ np.linalg.lstsq(basis.T, flat, rcond=None)[0]
     assert np.linalg.norm(left) < 1e-6 * np.linalg.norm(flat)
 
@@ -230,7 +229,7 @@ def test_what_only_a_straight_line_promises_is_no_gain(lag: float) -> None:
     """A course is found with parameters that move along straight lines, and counts where they put the car."""
     h = _car(_lags)
     moves = np.array([lag if name == "T_L" else 0.0 for name in h.free])
-    linear = h.residual - np.tensordot(moves, h.jacobian, 1)
+    linear = h.residual - np.tensordot(moves, slopes_of(h), 1)
     left, over = _bent(h, moves, np.zeros_like(h.residual), linear)
     car = _moved(h, moves)
     np.testing.assert_allclose(left, h.data.measured - car.response())
