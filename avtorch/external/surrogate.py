@@ -34,7 +34,8 @@ from avtorch.gap.engine.gauss_newton import fit, jacobian, objective, prior_term
 from avtorch.gap.engine.hypothesis import Hypothesis, plant_of
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import CLAIM_HZ
-from avtorch.gap.engine.search import other_limit, promises
+from avtorch.gap.engine.promises import promises
+from avtorch.gap.engine.search import other_limit
 from avtorch.gap.quantity import unit_of, words_of
 from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.gap.simulator.plant import GapPlant, plant

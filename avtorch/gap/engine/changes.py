@@ -32,7 +32,8 @@ from avtorch.gap.engine.joint import (
 )
 from avtorch.gap.engine.likelihood import log_sum
 from avtorch.gap.engine.priors import EFFECT_NATS, TEMPER, UNKNOWN_NATS
-from avtorch.gap.engine.search import limit_starts, tried
+from avtorch.gap.engine.promises import limit_starts
+from avtorch.gap.engine.search import tried
 from avtorch.gap.engine.shape_error import effect_energy, relative_size, shape_log_odds
 
 Progress = Callable[[str, int, int], None]

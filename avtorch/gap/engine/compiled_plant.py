@@ -39,13 +39,13 @@ _RING_A, _RING_Q = INDEX["ring_amplitude"], INDEX["ring_quadrature"]
 _RING_F, _RING_Z = INDEX["ring_frequency"], INDEX["ring_damping"]
 _FREE, _FREE_F = INDEX["free_pole"], INDEX["free_frequency"]
 _DRAG, _WIND, _VISCOUS = INDEX["drag"], INDEX["wind"], INDEX["viscous"]
-_ROLL, _CREEP = INDEX["resistance"], INDEX["creep"]
+_ROLL, _CREEP, _CREEP_AT = INDEX["resistance"], INDEX["creep"], INDEX["creep_fades"]
 _SPEED_LAG = INDEX["speed_lag"]
 _SENSOR_LAG, _SCALE, _BIAS = INDEX["sensor_lag"], INDEX["sensor_scale"], INDEX["sensor_bias"]
 
 _LEAST_FACTOR = 0.05  # as in `effects.speed_dependent_gain`
 _FREE_DAMPING = 0.5  # of the unnamed mode: no resonance, which would be a driveline's
-_CREEP_AT, _CREEP_OVER = 3.0, 0.5  # [m/s] as in `effects.low_speed_creep`
+_CREEP_OVER = 0.5  # [m/s] as in `effects.low_speed_creep`
 _NEUTRAL = NEUTRAL.copy()
 _COUNT = len(NEUTRAL)
 
@@ -169,7 +169,7 @@ def simulate(
         if v > 0.0:
             outer -= q[_ROLL]
         if q[_CREEP] != 0.0:
-            outer += q[_CREEP] / (1.0 + math.exp((v - _CREEP_AT) / _CREEP_OVER))
+            outer += q[_CREEP] / (1.0 + math.exp((v - p[_CREEP_AT]) / _CREEP_OVER))
         if starts[k]:
             a = accel0[k] - outer
             w = 0.0

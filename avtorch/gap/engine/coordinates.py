@@ -26,7 +26,7 @@ NAMES = (
     *("log_brake_gain", "log_brake_lag", "square_period", "log_lag_ratio", "inverse_jerk", "log_fall"),
     *("lag_slope", "gain_slope", "gain_step", "gain_ramp", "shift_depth", "shift_duration", "shift_hysteresis"),
     *("ring_amplitude", "ring_quadrature", "ring_frequency", "ring_damping", "drag", "wind", "viscous"),
-    *("resistance", "creep"),
+    *("resistance", "creep", "creep_fades"),
     *("sensor_lag", "sensor_bias", "sensor_scale", "speed_lag", "free_pole", "free_frequency"),
 )
 """Of the value vector (parameter,), in its order."""
@@ -44,6 +44,7 @@ for _name, _value in {
     "ring_frequency": 2.0,
     "ring_damping": 0.08,
     "free_frequency": 1.8,
+    "creep_fades": 3.0,
 }.items():
     NEUTRAL[INDEX[_name]] = _value
 
@@ -226,6 +227,11 @@ _DRAG = (
     _sized("drag", "aerodynamic_drag", "drag_per_m", "value", 0, 0.05),
     _nuisance("wind", "wind_mps", 0.0, 3.0, -12.0, 12.0),
 )
+_CREEP = (
+    _sized("creep", "low_speed_creep", "creep_mps2", "value", 0, 3),
+    # an idling car rolls at 5 to 10 km/h
+    _nuisance("creep_fades", "fades_at_mps", 2.5, 0.75, 0.5, 8.0),
+)
 _LATE_ACTUATOR = (_SQUARE, Coordinate("log_lag_ratio", "lag_ratio", "log", -2.5, 2.0, 0.7))
 
 EFFECTS: dict[str, EngineEffect] = {
@@ -234,7 +240,7 @@ EFFECTS: dict[str, EngineEffect] = {
         _one("dead_time", "delay_s", (0, 1.5), (0.06, 0.2, 0.4, 0.8)),
         _one("dead_band", "half_width_mps2", (0, 1.5), (0.05, 0.2, 0.5)),
         _one("backlash", "half_width_mps2", (0, 1.5), (0.05, 0.2, 0.5)),
-        _one("hand_over", "pause_s", (0, 2), (0.1, 0.3, 0.8)),
+        _one("hand_over", "pause_s", (0, 2), (0.1, 0.2, 0.4, 0.8, 1.2, 1.6)),
         EngineEffect("saturation", _SATURATION, ()),  # starts are quantiles of the command, see `search`
         EngineEffect("brake_throttle_asymmetry", _ASYMMETRY, ((-0.3, 0.0), (0.0, 0.6), (-0.3, 0.6), (0.3, 0.5))),
         EngineEffect("second_order_actuator", (_SQUARE,), ((0.01,), (0.04,), (0.1,), (0.7,)), "never"),
@@ -250,7 +256,7 @@ EFFECTS: dict[str, EngineEffect] = {
         EngineEffect("aerodynamic_drag", _DRAG, ((4e-4, 0.0), (4e-4, 5.0)), "may", _SPEED),
         _one("viscous_drag", "drag_per_s", (0, 2), (0.012,), name="viscous", needs=_SPEED),
         _one("constant_resistance", "resistance_mps2", (0, 4), (0.1,), name="resistance"),
-        _one("low_speed_creep", "creep_mps2", (0, 3), (0.3,), name="creep", needs=_SPEED),
+        EngineEffect("low_speed_creep", _CREEP, ((0.3, 3.0), (0.3, 2.0)), "may", _SPEED),
         _one("sensor_lag", "lag_s", (0, 6), (0.1, 0.3), needs=_ACCEL),
         _one("sensor_bias", "bias_mps2", (-4, 4), (0.1,), needs=_ACCEL),
         _one("sensor_scale", "scale", (-0.7, 1.5), (0.1,), link="less one", needs=_BOTH),

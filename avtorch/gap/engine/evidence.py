@@ -21,7 +21,7 @@ from avtorch.gap.engine.coordinates import COORDINATES, EFFECTS, INDEX
 from avtorch.gap.engine.gauss_newton import linear_priors, normal_prior, slopes_of, whitened_under_noise
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import HALF_LOG_2PI, claimed, freedom, log_sum
-from avtorch.gap.engine.priors import LOST_NATS, ONSET_ODDS, SHIFT_NATS, TRIED_NATS
+from avtorch.gap.engine.priors import LOST_S, ONSET_ODDS, SHIFT_NATS, TRIED_NATS
 from avtorch.gap.engine.shape_error import effect_energy, shape_likelihood, shape_log_prior
 
 _STUDENT_3 = math.log(2 / (math.pi * math.sqrt(3)))  # log density at the centre, scale 1
@@ -81,9 +81,16 @@ def evaluate_evidence(h: Hypothesis) -> Hypothesis:
     volume = len(names) * HALF_LOG_2PI - 0.5 * float(np.linalg.slogdet(h.information)[1])
     prior = float(log_prior(h, names, torch.as_tensor(h.values[[INDEX[n] for n in names]])))
     h.evidence = gain + log_sum(h.shape_log) + prior + volume + _onset_odds(h) + _force_density(h)
-    h.evidence -= LOST_NATS * len(h.lost) + SHIFT_NATS * len(h.shift_speeds) * ("gear_shift" in h.effects)
+    h.evidence -= lost_nats(h) * len(h.lost) + SHIFT_NATS * len(h.shift_speeds) * ("gear_shift" in h.effects)
     h.score = h.evidence - TRIED_NATS * (len(h.effects) + (h.force is not None))
     return h
+
+
+def lost_nats(h: Hypothesis) -> float:
+    """What a stretch of lost messages costs [nats]: it is one of all starts and lengths that the car's lag tells
+    apart."""
+    lag = max(h["T_L"], h.data.dt)
+    return math.log(max(len(h.data.time) * h.data.dt / lag * LOST_S / lag, 1.0))
 
 
 def _force_density(h: Hypothesis) -> float:

@@ -3,12 +3,13 @@ r"""Lost messages: stretches of rows in which the car is better explained by the
 Where the messages of rows i to j - 1 are lost, the demand changes by w_k = K (u_{i-1} - u_k), i <= k < j: no parameter
 is free. A set of stretches gains
 
-    G = s' w - 1/2 w' A w - LOST_NATS (stretches),
+    G = s' w - 1/2 w' A w - price (stretches),
 
-s and A being score and information of `demand_filter`. Pulses that do not overlap in A add up, and the best set of
-disjoint stretches is then a weighted interval scheduling (Kleinberg and Tardos 2006, ch. 6.1; Viterbi's recursion of a
-semi-Markov chain). What the tails of close stretches share is settled afterwards: each stretch in turn is moved,
-resized or dropped given all others, until nothing gains (iterated conditional modes; Besag 1986); `nats` is G itself.
+s and A being score and information of `demand_filter`, the price that of `evidence.lost_nats`. Pulses that do not
+overlap in A add up, and the best set of disjoint stretches is then a weighted interval scheduling (Kleinberg and Tardos
+2006, ch. 6.1; Viterbi's recursion of a semi-Markov chain). What the tails of close stretches share is settled
+afterwards: each stretch in turn is moved, resized or dropped given all others, until nothing gains (iterated
+conditional modes; Besag 1986); `nats` is G itself.
 
 The residual with its sign turned around is a negative control: noise gains as much there, lost messages nothing.
 """
@@ -30,13 +31,10 @@ from avtorch.gap.engine.demand_filter import (
     response_rows,
     take_out,
 )
-from avtorch.gap.engine.evidence import evaluate_evidence
+from avtorch.gap.engine.evidence import evaluate_evidence, lost_nats
 from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.priors import LOST_NATS, WARM_S
-
-LONGEST_S = 1.4
-"""Longest stretch [s]: a link that is silent for longer has timed out, and the controller with it."""
+from avtorch.gap.engine.priors import LOST_S, WARM_S
 
 _SWEEPS = 6  # of conditional modes; three are enough for most drives
 _ROUNDS = 3  # of stretches given parameters, parameters given stretches
@@ -73,7 +71,7 @@ def with_lost_messages(h: Hypothesis, mask: BoolArray | None = None) -> Hypothes
     Parameters and stretches are found in turn: fewer errors of one show more of the other.
     """
     found = lost_messages(h, mask=mask)
-    if found.nats < LOST_NATS or found.nats - lost_messages(h, -1.0, mask).nats < LOST_NATS:
+    if found.nats < lost_nats(h) or found.nats - lost_messages(h, -1.0, mask).nats < lost_nats(h):
         return None
     best: Hypothesis | None = None
     for _ in range(_ROUNDS):
@@ -119,9 +117,9 @@ def pulse_model(h: Hypothesis, mask: BoolArray | None = None) -> PulseModel:
         information=information,
         cover=frame_cover(h),
         free=np.ascontiguousarray(np.minimum.accumulate(rows[::-1])[::-1]),
-        longest=max(1, min(round(LONGEST_S / data.dt), len(information) - 1)),
+        longest=max(1, min(round(LOST_S / data.dt), len(information) - 1)),
         tail=response_rows(h),
-        penalty=LOST_NATS,
+        penalty=lost_nats(h),
     )
 
 

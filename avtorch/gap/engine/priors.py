@@ -31,8 +31,9 @@ SHIFT_NATS = 3.0
 ONSET_ODDS = 1 / 3
 """Probability that an effect that may set in during a drive did so [-]; when, one of as many times as there are
 frames."""
-LOST_NATS = 5.0
-"""A stretch of lost messages [nats]: its start, one of thousands of rows, and its length."""
+LOST_S = 1.4
+"""Longest stretch of lost messages [s]: a link that is silent for longer has timed out, and the controller with it. The
+price of a stretch follows, see `evidence.lost_nats`."""
 
 SHAPE_ERROR = 0.06
 """Relative error of a named effect's response [-], half-normal: a table's equation is not quite the car's."""

@@ -15,21 +15,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 
-from avtorch.arrays import FloatArray
-from avtorch.gap.engine.coordinates import EFFECTS, INDEX, EngineEffect, base_name
-from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.coordinates import EFFECTS, EngineEffect, base_name
 from avtorch.gap.engine.evidence import evaluate_evidence
 from avtorch.gap.engine.force_base import prices, resized, with_force_map
-from avtorch.gap.engine.gauss_newton import fit, linearised, normal_prior, objective, whitened_jacobian
+from avtorch.gap.engine.gauss_newton import fit, objective
 from avtorch.gap.engine.gear_shifts import refined_shift_speeds, shift_speeds, upshift_rows
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import log_likelihood, whiten
 from avtorch.gap.engine.lost_messages import with_lost_messages
 from avtorch.gap.engine.priors import WITHIN_NATS
+from avtorch.gap.engine.promises import later_than_the_start, promises
 from avtorch.gap.engine.recorder import traded
 
 _MOST_FITS, _FEWEST_FITS = 160, 40  # of a search; a hard case of five minutes takes about fifty
@@ -37,25 +34,9 @@ _GRID_FITS = 4e6  # fits times grid points: what a long drive may cost
 _WIDTH, _LATER_WIDTH, _SECOND_WIDTH = 9, 6, 4  # effects fitted from the base, from a set, on a second way in
 _FINISHED = 3  # of these, how many are finished
 _RAMPS = 10  # of a gain that changes, from a second to the drive's length
-_MARGIN_S = 8.0  # no onset this near to an end of the drive
 _LEAST_PROMISE = 1.5  # nats: less is the gain of a parameter that does nothing
-_SLOPES = {
-    "dead_time": 0.02,
-    "sensor_lag": 0.02,
-    "speed_lag": 0.02,
-    "square_period": 0.002,
-}  # where a recorder hides a finite step
 _SLOW_MPS = 3.0
 _SHARP = ("sensor_bias", "constant_resistance", "sensor_scale")  # effects that set in at once
-
-
-class Promise(NamedTuple):
-    """What an effect may gain to first order [nats], from which start, and from which time on."""
-
-    nats: float
-    effect: str
-    start: tuple[float, ...]
-    onset: float | None
 
 
 @dataclass(eq=False)
@@ -136,7 +117,7 @@ class Search:
                 now = now.without(e)
         if h.force is not None or set(now.effects) <= set(base.effects):
             return base
-        return max(base, self._pruned(self._put(fit(now, 10)), last=True), key=lambda h: h.score)
+        return max(base, self._pruned(self._put(fit(now, 10))), key=lambda h: h.score)
 
     def extended(self, start: Hypothesis, another_way: bool = True) -> Hypothesis:
         """The best set that grows from `start`, by one more effect at a time."""
@@ -157,7 +138,8 @@ class Search:
             grown = self._grow(best, width if best is start else later_width)
             if not grown:
                 break
-            grown = sorted((self._put(self._finish(h)) for h in grown[:finished]), key=lambda h: -h.score)
+            finished_sets = [self._put(self._finish(h)) for h in grown[:finished]]
+            grown = sorted([*finished_sets, *self._set_in_later(finished_sets)], key=lambda h: -h.score)
             first = grown if best is start else first
             if grown[0].score < best.score:
                 break
@@ -186,7 +168,9 @@ class Search:
     def _put(self, h: Hypothesis, anew: bool = False) -> Hypothesis:
         evaluate_evidence(h if h.base is h else resized(h)).jacobian = None
         key = self.key(h)
-        if anew or key not in self.visited or self.visited[key].score < h.score:
+        kept = self.visited.get(key)
+        replaced = kept is None or (kept.base is not kept and (anew or kept.score < h.score))  # gains count from a base
+        if replaced:
             self.visited[key] = h
         return h
 
@@ -250,11 +234,24 @@ class Search:
             h = refined_onset(h, e)
         return h
 
-    def _pruned(self, h: Hypothesis, last: bool = False) -> Hypothesis:
-        """The best after leaving out each effect but the last (that too where `last`) in turn, and each onset."""
+    def _set_in_later(self, found: Sequence[Hypothesis]) -> Iterator[Hypothesis]:
+        """The same sets with the last effect from a time on, where that promises more: one that is fitted over the
+        whole drive shows by its values when it set in, as no start did."""
+        for h in found:
+            e = EFFECTS[h.effects[-1]] if h.effects else None
+            rest = None if e is None else self.without(h, e.name)
+            if e is None or rest is None or e.onset != "may" or e.name in h.onsets or self._ended():
+                continue
+            at = tuple(h[c.name] for c in e.coordinates)
+            later = later_than_the_start(rest, e, at)
+            if later is not None:
+                yield self._put(refined_onset(self._add(rest, e.name, later.start, later.onset), e.name))
+
+    def _pruned(self, h: Hypothesis) -> Hypothesis:
+        """The best after leaving out each effect in turn, and each onset: what was refined for the last one stays."""
         while h.effects and not self._ended():
             others = []
-            for e in h.effects if last else h.effects[:-1]:
+            for e in h.effects:
                 if e == "~linear":
                     continue
                 self.fits += 1
@@ -301,188 +298,6 @@ def tried(h: Hypothesis, among: Collection[str]) -> list[EngineEffect]:
             continue
         out.append(e)
     return out
-
-
-# promises ------------------------------------------------------------------------------------------------------------
-class Projection:
-    """The residual and any response less what the free parameters take, in units of the noise.
-
-    Priors are rows of their own: a recorder stretched to its limits to hide an effect pulls back.
-    """
-
-    def __init__(self, h: Hypothesis) -> None:
-        names = h.free
-        slopes, precision, pull = linearised(h, names)
-        W = whitened_jacobian(h, slopes)
-        self.rows = len(W)
-        A = np.hstack([W, np.diag(np.sqrt(precision))])
-        r = np.concatenate([whiten(h.data, h.covariance, h.residual), pull / np.sqrt(np.maximum(precision, 1e-30))])
-        size = np.linalg.norm(A, axis=1)
-        self._basis = np.linalg.qr((A[size > 1e-9] / size[size > 1e-9, None]).T)[0]
-        self._basis_by_frame = _by_frame(h.data, self._basis[: -self.rows])
-        self.residual = r - self._basis @ (self._basis.T @ r)
-
-        self._data, self._spread = h.data, None
-        if h.force_spread is not None:
-            inverse = np.linalg.inv(np.linalg.cholesky(h.covariance))
-            self._spread = inverse @ h.force_spread @ np.swapaxes(inverse, 1, 2)
-        self._start = self._nats(self.residual)
-
-    def __call__(self, whitened: FloatArray) -> FloatArray:
-        x = np.concatenate([whitened, np.zeros(self.rows)])
-        return x - self._basis @ (self._basis.T @ x)
-
-    def sizes_from(self, whitened: FloatArray) -> FloatArray:
-        """Square (frame,) of the projected response that begins with each frame: whole, less its part in the span."""
-        x = _by_frame(self._data, whitened)
-        spanned = (x[:, None] @ self._basis_by_frame)[:, 0]
-        energy, spanned = (x * x).sum(1)[::-1].cumsum(), spanned[::-1].cumsum(0)
-        return np.maximum(energy - (spanned**2).sum(1), 0.0)[::-1]
-
-    def nats(self, free: FloatArray, e: EngineEffect, start: Sequence[float]) -> float:
-        """What the best multiple of a projected response gains, its size penalised by the effect's prior; the noise's
-        covariance is that of what is left, as everywhere: a band's own excess does not hide what explains it."""
-        gain, size = float(free @ self.residual), float(free @ free)
-        sds = [normal_prior(c.name, 0.0)[1] for c in e.coordinates if c.faint]
-        precision = sum((x / sd) ** 2 for x, sd in zip(start, sds, strict=False))
-        shares = gain / (size + 1), gain / max(size, 1e-9)
-        return max(self._nats(self.residual - x * free) - 0.5 * precision * x * x for x in shares) - self._start
-
-    def _nats(self, x: FloatArray) -> float:
-        data = self._data
-        shape = data.channel_count, data.frame_count, data.bin_count
-        nats = log_likelihood(data, x[: -self.rows].reshape(shape), self._spread)[0]
-        return nats - 0.5 * float(x[-self.rows :] @ x[-self.rows :])
-
-
-def _by_frame(data: DriveData, whitened: FloatArray) -> FloatArray:
-    """Coefficients of all channels (channel x frame x bin, ...) by frame: (frame, channel x bin, ...)."""
-    by_frame = whitened.reshape(data.channel_count, data.frame_count, data.bin_count, *whitened.shape[1:])
-    by_frame = np.moveaxis(by_frame, 1, 0)
-    return np.ascontiguousarray(by_frame.reshape(data.frame_count, -1, *whitened.shape[1:]))
-
-
-def promises(h: Hypothesis, candidates: Sequence[EngineEffect]) -> list[Promise]:
-    """Gains of further effects to first order, the best first: at most two a effect that act all the time, and one
-    that sets in later."""
-    projection = Projection(h)
-    adjoint = _adjoint_rows(h, projection)
-    response = h.rows()
-    out: list[Promise] = []
-    for e in candidates:
-        always: list[Promise] = []
-        later: list[Promise] = []
-        for start in e.starts or limit_starts(h):
-            for kept in (False, True) if e.name == "dead_time" else (False,):
-                p = h.values.copy()
-                for c, x in zip(e.coordinates, start, strict=True):
-                    p[INDEX[c.name]] = x
-                if kept:  # a lag hides most of a delay
-                    p[0] = max(p[0] - 0.8 * start[0], min(p[0], 0.06))
-                # the simulator runs an effect only where a hypothesis has it
-                beside = h if e.kind is None and h.baseline is None else h.with_effect(e.name, start)
-                rows = beside.rows(p)
-                change = h.data.transform(rows) - h.predicted
-                whitened = whiten(h.data, h.covariance, change)
-                if not kept:
-                    always += _by_slope(beside, projection, e, start)
-                if e.onset != "must":
-                    always += _whole(h, projection, e, start, whitened)
-                if e.onset != "never":
-                    steps = sum(z * (a - b) for z, a, b in zip(adjoint, rows, response, strict=True))
-                    assert isinstance(steps, np.ndarray)
-                    later += _onsets(beside, projection, e, start, p, whitened, steps)
-        always.sort(key=lambda x: -x.nats)
-        later.sort(key=lambda x: -x.nats)
-        if always and later and later[0].nats < always[0].nats - 1:
-            later = []
-        out += always[:2] + later[:1]
-    return sorted(out, key=lambda x: -x.nats)
-
-
-def _whole(
-    h: Hypothesis, projection: Projection, e: EngineEffect, start: tuple[float, ...], whitened: FloatArray
-) -> list[Promise]:
-    free = projection(whitened)
-    size, gain = float(free @ free), float(free @ projection.residual)
-    if size <= 1e-6 * float(whitened @ whitened) or (gain <= 0 and e.one_sided):
-        return []
-    turned = start if gain > 0 or e.name == "driveline_oscillation" else tuple(-x for x in start)
-    return [Promise(projection.nats(free, e, start), e.name, turned, None)]
-
-
-def _by_slope(h: Hypothesis, projection: Projection, e: EngineEffect, start: tuple[float, ...]) -> list[Promise]:
-    """By the slope at zero, where the recorder hides a finite step."""
-    name = e.coordinates[0].name
-    if name not in _SLOPES or e.onset == "must":
-        return []
-    p = h.values.copy()
-    p[INDEX[name]] = _SLOPES[name]
-    change = (h.response(p) - h.predicted) * (start[0] / _SLOPES[name])
-    free = projection(whiten(h.data, h.covariance, change))
-    gain = float(free @ projection.residual)
-    return [Promise(projection.nats(free, e, start), e.name, start, None)] if gain > 0 else []
-
-
-def _onsets(
-    h: Hypothesis,
-    projection: Projection,
-    e: EngineEffect,
-    start: tuple[float, ...],
-    values: FloatArray,
-    whitened: FloatArray,
-    steps: FloatArray,
-) -> list[Promise]:
-    """The two best onsets, and those of effects that are in: the residual's adjoint prices all rows at once, then the
-    response is computed."""
-    data = h.data
-    if data.frame_count < 2:
-        return []
-    gains = np.cumsum(steps[::-1])[::-1]
-    sizes = projection.sizes_from(whitened)
-    size = np.interp(data.time, data.frame_time - 0.5 * data.hop_s, sizes)
-    size = np.maximum(size, 0.15 * sizes.max())
-    inside = (data.time > data.time[0] + _MARGIN_S) & (data.time < data.time[-1] - _MARGIN_S)
-    priced = np.where(inside & ((gains > 0) | (not e.one_sided)), 0.5 * gains**2 / (size + 1), 0.0)
-    tried = [(onset, 0.0) for onset in sorted(set(h.onsets.values()))]
-    for _ in range(2):
-        row = int(priced.argmax())
-        if priced[row] <= 0:
-            break
-        tried.append((float(data.time[row]), 3.0))
-        priced[np.abs(data.time - data.time[row]) < data.hop_s] = 0
-    out = []
-    for onset, price in tried:
-        acts = h.onset_vector()
-        for c in e.coordinates:
-            acts[INDEX[c.name]] = onset
-        free = projection(whiten(data, h.covariance, h.response(values, acts) - h.predicted))
-        n, gain = float(free @ free), float(free @ projection.residual)
-        if n > 1e-9 and (gain > 0 or not e.one_sided):
-            alone = sum(bool(c.faint) for c in e.coordinates) == 1  # the first one is the size, the others its shape
-            scaled = (start[0] * float(np.clip(gain / n, -4, 4)), *start[1:]) if alone else start
-            out.append(Promise(projection.nats(free, e, start) - price, e.name, scaled, onset))
-    return out
-
-
-def _adjoint_rows(h: Hypothesis, projection: Projection) -> list[FloatArray]:
-    """The projected residual on the rows of each channel: its inner product with a response is that of the whitened
-    coefficients."""
-    data = h.data
-    r = projection.residual[: -projection.rows].reshape(data.channel_count, data.frame_count, data.bin_count)
-    inverse = np.linalg.inv(np.linalg.cholesky(h.covariance))[data.band_of_bin]
-    out = []
-    for i in range(data.channel_count):
-        out.append(data.adjoint(np.sum([inverse[:, c, i] * r[c] for c in range(i, data.channel_count)], axis=0)))
-    return out
-
-
-def limit_starts(h: Hypothesis) -> list[tuple[float, float]]:
-    """Starts of both limits, from the largest commands (inverse, [s²/m])."""
-    x = h["K_L"] * h.data.command
-    high, low = max(float(np.percentile(x, 99.9)), 0.05), min(float(np.percentile(x, 0.1)), -0.05)
-    pairs = ((0.7, 1.3), (0.4, 1.3), (1.3, 0.7), (1.3, 0.4), (0.7, 0.7))
-    return [(1 / (high * f), 1 / (-low * g)) for f, g in pairs]
 
 
 # finishing -----------------------------------------------------------------------------------------------------------

@@ -27,7 +27,8 @@ from avtorch.gap.engine.family import FAMILIES, FORMS, OWN, family_of
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import whiten
 from avtorch.gap.engine.priors import EFFECT_NATS
-from avtorch.gap.engine.search import Projection, tried
+from avtorch.gap.engine.promises import Projection
+from avtorch.gap.engine.search import tried
 from avtorch.gap.quantity import RESAMPLES, Quantity, of_fields, plain, resampled
 from avtorch.gap.result.attribution import Location
 from avtorch.gap.result.counted_rows import HORIZON_S, Blocks

@@ -71,9 +71,9 @@ def _recorded(x: FloatArray, time: FloatArray, delay: float, time_constant: floa
 
 
 def fitted_hypothesis(
-    log: Log, effect: str = "", start: Sequence[float] = (), onset: float | None = None
+    log: Log | Sequence[Log], effect: str = "", start: Sequence[float] = (), onset: float | None = None
 ) -> Hypothesis:
-    """A fit of one effect, or of none, to a log."""
+    """A fit of one effect, or of none, to a log, or to several."""
     h = Hypothesis(DriveData.of(log))
     for name in h.data.channels:
         h[f"{name}_delay"], h[f"{name}_filter"] = LATE[name], FILTER[name]

@@ -34,7 +34,7 @@ VALUES = {
     "aerodynamic_drag": (4e-4, 2.0),
     "viscous_drag": (0.013,),
     "constant_resistance": (0.12,),
-    "low_speed_creep": (0.4,),
+    "low_speed_creep": (0.4, 2.2),
     "sensor_lag": (0.23,),
     "sensor_bias": (-0.1,),
     "sensor_scale": (0.12,),

@@ -16,11 +16,13 @@ import pytest
 from avtorch import diagnose
 from avtorch.errors import InputError
 from avtorch.gap import DeadTime, DrivelineOscillation, GainChange, SensorBias
-from avtorch.gap.engine.coordinates import EFFECTS
+from avtorch.gap.engine.coordinates import EFFECTS, INDEX
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.evidence import evaluate_evidence
 from avtorch.gap.engine.inference import infer
-from avtorch.gap.engine.search import promises
+from avtorch.gap.engine.likelihood import whiten
+from avtorch.gap.engine.promises import Projection, promises
+from avtorch.gap.engine.search import Search
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.effect import Effect
 from avtorch.io import Log
@@ -74,6 +76,41 @@ def test_an_effect_is_found_with_its_size(effect: Effect, key: str, rotating_see
     found = found_in(recorded_log([effect], seed=rotating_seed), FEW)
     says(found, effect.name, {key: getattr(effect, key)})
     assert found.onset_s is None
+
+
+def test_a_base_that_is_fitted_once_more_stays_the_base() -> None:
+    """Gains count from it, and what is told of a car without effects is told by it."""
+    base = fitted_hypothesis(recorded_log())
+    base["K_L"] += 0.01  # not quite the best: a set that loses its effects again is better
+    search = Search(base.evaluate(), ["dead_time", "hand_over"])
+    base.base = base
+    search.run()
+    rest = [h for h in search.visited.values() if h.effects]
+    assert rest
+    assert search.visited[search.key(base)] is base
+
+
+def test_what_sets_in_while_the_car_stands_is_priced_by_what_it_leaves() -> None:
+    """No row shows the onset, and the error has raised the noise that it is measured by: the price is that of the
+    noise without it."""
+    log = recorded_log(seconds=80.0)
+    assert log.accel is not None
+    later = replace(log, accel=log.accel + BIAS * (log.time > 45.0))
+    h, e = fitted_hypothesis([later[log.time < 38.0], later[log.time > 52.0]]), EFFECTS["sensor_bias"]
+    projection, acts = Projection(h), h.onset_vector()
+    biased = h.with_effect(e.name, e.starts[0])
+    whole = whiten(h.data, h.covariance, biased.response() - h.predicted)
+    frames = projection.nats_from(whole, projection.sizes_from(whole))
+    begun = float(h.data.time[h.data.bounds[1]])
+    acts[INDEX[e.name]] = begun
+    since = whiten(h.data, h.covariance, biased.response(onsets=acts) - h.predicted)
+    exact = projection.nats(projection(since), e, e.starts[0])
+    first = int(np.searchsorted(h.data.frame_time, begun))
+    assert exact > 20
+    assert frames.argmax() == first
+    # less the prior of its size, and what the free parameters take
+    assert frames[first] == pytest.approx(exact, rel=0.1)
+    assert any(p.onset == begun and p.nats > 0.9 * exact for p in promises(h, [e]))
 
 
 @pytest.mark.slow

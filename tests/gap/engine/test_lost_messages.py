@@ -11,7 +11,7 @@ from scipy.linalg import toeplitz
 from avtorch import Log
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.evidence import evaluate_evidence
+from avtorch.gap.engine.evidence import evaluate_evidence, lost_nats
 from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.lost_messages import (
@@ -25,7 +25,6 @@ from avtorch.gap.engine.lost_messages import (
     schedule,
     with_lost_messages,
 )
-from avtorch.gap.engine.priors import LOST_NATS
 from tests.bars import BAR, log_odds
 
 DT, LAG, GAIN = 0.02, 0.3, 0.9
@@ -196,7 +195,7 @@ def test_the_hypothesis_with_them_explains_the_drive(rotating_seed: int) -> None
     assert found is not None
     assert found.effects == ["command_hold"]
     assert _at_their_places(found, found.lost)
-    assert found.score > h.score + LOST_NATS * len(LOST)
+    assert found.score > h.score + lost_nats(h) * len(LOST)
     # the lag and the gain, which had to make up for the losses, are the car's again
     sd = np.sqrt(np.diag(np.linalg.inv(found.information)))
     for name, true in (("T_L", LAG), ("K_L", GAIN)):
