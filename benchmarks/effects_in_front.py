@@ -116,7 +116,7 @@ def in_front(log: Log, size: float) -> None:
     """Prints a row per effect that no chance decides, and the counts."""
     control, alone = budget_of(log), base_fit(DriveData.of(log))
     print(f"{HEADER}\n| untouched | | | | | | | {causes(control)} |", flush=True)
-    T_L, K_L = control.baseline["T_L"], control.baseline["K_L"]
+    T_L, K_L = alone["T_L"], alone["K_L"]
     rows: list[InFront] = []
     for number, effect in enumerate(IN_FRONT):
         if EFFECTS[effect].random:

@@ -8,8 +8,10 @@ import pytest
 
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.budget import Budget, ChancePart, Part, Unexplained
+from benchmarks.blindtest import IN_FRONT
 from benchmarks.budget_cells import causes, counted
-from benchmarks.effects_in_front import HEADER, InFront, Size, closing, compared
+from benchmarks.effects_in_front import HEADER, InFront, Size, closing, compared, in_front
+from tests.gap.engine.recorded import recorded_log
 
 HALF = Quantity(0.5, 0.1, 0.4, 0.6)
 
@@ -99,3 +101,16 @@ def test_causes_are_told_with_shares_and_intervals() -> None:
     found = made(part("dead_time", delay_s=(0.3, 0.25, 0.35)), part("backlash", 0.2), chance=(ChancePart("gust", 0.8),))
     assert causes(found) == "dead_time 50%: 0.3 (0.25 to 0.35); gust, by chance"
     assert causes(made()) == "none"
+
+
+@pytest.mark.slow
+def test_a_log_is_answered_with_an_effect_in_front_of_it(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("benchmarks.effects_in_front.IN_FRONT", {"sensor_bias": IN_FRONT["sensor_bias"]})
+    in_front(recorded_log(), 1.0)
+    untouched, row, *counts = capsys.readouterr().out.splitlines()[2:]
+    assert untouched.startswith("| untouched |")
+    assert row.startswith("| sensor_bias (")
+    assert row.split("|")[2].strip() == "named"
+    assert counts[0].startswith("named 1 of 1")
