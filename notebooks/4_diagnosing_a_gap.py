@@ -67,7 +67,8 @@ plots.show(over_diagnosis.which_figure(found), OUT / "which.png")
 # %% [markdown]
 # Shown, a diagnosis is its verdict and the car's parameters; printed, it is all that was found. In the picture, blue
 # bars are the hypotheses that this log cannot distinguish. `unknown` means that the cause is not in the table. It is
-# always a hypothesis, and where it comes first, as here, the diagnosis names no effect: a minute is short.
+# always a hypothesis; where it comes first, the diagnosis names no effect. Here one is named, by a little: a minute is
+# short.
 #
 # ## Where the gap lies
 
@@ -75,8 +76,7 @@ plots.show(over_diagnosis.which_figure(found), OUT / "which.png")
 plots.show(over_diagnosis.road_figure(found), OUT / "road.png")
 
 # %% [markdown]
-# The stretch that tells most, as measured and by the baseline simulator. With a cause named, the simulator with that
-# cause would be drawn as well.
+# The stretch that tells most, as measured, by the baseline simulator, and by the simulator with the cause that is named.
 #
 # ## The next experiment
 #
@@ -118,10 +118,9 @@ else:
     print("not distinguished:", ", ".join(both.verdict.alias_set))
 
 # %% [markdown]
-# Both drives are diagnosed together, and now an effect is named. It is not as certain as was expected, as the
-# expectation takes the equations of the table for exact.
-#
-# ## How far the gap shrinks
+# Both drives are diagnosed together. It does not always get better: a delay that wanders from one drive to the other
+# fits the two better than the effect alone, although neither drive shows one by itself and the car has none. So
+# `unknown` leads now, wrongly, and the effect comes second.
 
 # %%
 plots.show(over_diagnosis.where_figure(both), OUT / "where.png")
@@ -158,7 +157,7 @@ for name, answer in (("first drive", found), ("both drives", both)):
 # %% [markdown]
 # ## Back into the simulator
 #
-# `found.plant` is the repaired simulator. As a file it is a few lines of TOML, and it drives in `avtorch.simulate` like
+# `plant` is the repaired simulator, here with free forms in the place of a name. As a file it is a few lines of TOML, and it drives in `avtorch.simulate` like
 # any other plant.
 
 # %%

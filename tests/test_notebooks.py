@@ -115,10 +115,11 @@ def a_drive_watched_and_saved(names: Names) -> None:
 
 def diagnosing_a_gap(names: Names) -> None:
     found, both, (true,) = names["found"], names["both"], names["case"].names
-    assert found.verdict.name == "unknown"
-    assert true in found.verdict.alias_set
+    assert found.verdict.names == (true,)
+    assert "unknown" in found.verdict.alias_set
     assert names["ahead"] is not None
-    assert both.verdict.names == (true,)
+    assert both.verdict.name == "unknown"
+    assert true in both.verdict.alias_set
     shrinkage = both.shrinkage
     assert shrinkage is not None
     assert shrinkage.top.after < shrinkage.top.before
