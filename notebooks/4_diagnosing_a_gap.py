@@ -76,7 +76,8 @@ plots.show(over_diagnosis.which_figure(found), OUT / "which.png")
 plots.show(over_diagnosis.road_figure(found), OUT / "road.png")
 
 # %% [markdown]
-# The stretch that tells most, as measured, by the baseline simulator, and by the simulator with the cause that is named.
+# The stretch that tells most, as measured, by the baseline simulator, and by the simulator with the cause that is
+# named.
 #
 # ## The next experiment
 #
@@ -157,8 +158,8 @@ for name, answer in (("first drive", found), ("both drives", both)):
 # %% [markdown]
 # ## Back into the simulator
 #
-# `plant` is the repaired simulator, here with free forms in the place of a name. As a file it is a few lines of TOML, and it drives in `avtorch.simulate` like
-# any other plant.
+# `plant` is the repaired simulator, here with free forms in the place of a name. As a file it is some lines of TOML, and
+# it drives in `avtorch.simulate` like any other plant.
 
 # %%
 files = both.write(OUT)
