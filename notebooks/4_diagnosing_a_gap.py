@@ -158,8 +158,8 @@ for name, answer in (("first drive", found), ("both drives", both)):
 # %% [markdown]
 # ## Back into the simulator
 #
-# `plant` is the repaired simulator, here with free forms in the place of a name. As a file it is some lines of TOML, and
-# it drives in `avtorch.simulate` like any other plant.
+# `plant` is the repaired simulator, here with free forms in the place of a name. As a file it is some lines of TOML,
+# and it drives in `avtorch.simulate` like any other plant.
 
 # %%
 files = both.write(OUT)
