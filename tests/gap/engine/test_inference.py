@@ -21,7 +21,7 @@ from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.evidence import evaluate_evidence
 from avtorch.gap.engine.inference import infer
 from avtorch.gap.engine.likelihood import whiten
-from avtorch.gap.engine.promises import Projection, promises
+from avtorch.gap.engine.promises import Projection, later_than_the_start, promises
 from avtorch.gap.engine.search import Search
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.effect import Effect
@@ -111,6 +111,17 @@ def test_what_sets_in_while_the_car_stands_is_priced_by_what_it_leaves() -> None
     # less the prior of its size, and what the free parameters take
     assert frames[first] == pytest.approx(exact, rel=0.1)
     assert any(p.onset == begun and p.nats > 0.9 * exact for p in promises(h, [e]))
+
+
+def test_an_effect_found_over_the_whole_drive_tells_when_it_set_in() -> None:
+    log, e = recorded_log(), EFFECTS["sensor_bias"]
+    assert log.accel is not None
+    for since, later in ((20.0, True), (-1.0, False)):
+        h = fitted_hypothesis(replace(log, accel=log.accel + BIAS * (log.time >= since)))
+        found = later_than_the_start(h, e, (BIAS,))
+        assert (found is not None) == later
+        if found is not None and found.onset is not None:
+            assert abs(found.onset - since) < h.data.hop_s
 
 
 @pytest.mark.slow
