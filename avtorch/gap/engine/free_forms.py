@@ -49,6 +49,7 @@ WANDER_S = (12.0, 30.0, 80.0)
 ONSET_SHARES = (0.2, 0.35, 0.5, 0.65, 0.8)
 """Shares of a drive's frames from which on a form may act: a sixth of a drive off costs a third of its evidence."""
 _DELAY_STEP_S = 0.02  # of the finite difference in a delay: about the typical wandering
+_DELAY_GRID_S = 0.05  # between delays that are simulated; responses between them are interpolated
 _ROUNDS = 4  # of coefficients given the noise, noise given coefficients; the best is the answer
 _COURSES = 3  # of what wanders, each under the noise that the last one left
 _OF_LAGS = ("linear", "sided")  # forms in whose fit the car's own lag moves far
@@ -176,7 +177,7 @@ def wandering(h: Hypothesis) -> dict[str, FreeFormFit]:
     The course has no mean: what is constant belongs to the car's or the recorder's own gain and delay, with their
     priors. Every grid point is as likely as any other, so the best of them costs the logarithm of their number.
     """
-    return {kind: _wandering(h, response, WANDER_SD[kind]) for kind, response in _wandering_responses(h).items()}
+    return {kind: _wandering(h, kind, response) for kind, response in _wandering_responses(h).items()}
 
 
 def demand_response(h: Hypothesis, demands: FloatArray, lags: FloatArray, *, backwards: bool = False) -> FloatArray:
@@ -316,17 +317,13 @@ def _first_order_backwards(
 def _wandering_responses(h: Hypothesis) -> dict[str, FloatArray]:
     """Derivative (channel, frame, bin) of the response by the logarithm of its gain, of that of braking alone, and by a
     delay of all channels."""
-    late, early = h.values.copy(), h.values.copy()
-    for channel in h.data.channels:
-        late[INDEX[f"{channel}_delay"]] += _DELAY_STEP_S
-        early[INDEX[f"{channel}_delay"]] -= _DELAY_STEP_S
     signals = h.on_grid()
-    change = h.data.transform(h.recorded(*signals, late)) - h.data.transform(h.recorded(*signals, early))
+    late, early = (h.data.transform(h.recorded(*signals, _later(h, s))) for s in (_DELAY_STEP_S, -_DELAY_STEP_S))
     braking = demand_response(h, np.minimum(h["K_L"] * h.command(), 0.0)[None], np.array([h["T_L"]]))[0]
-    return {"gain": h.predicted, "braking": braking, "delay": change / (2.0 * _DELAY_STEP_S)}
+    return {"gain": h.predicted, "braking": braking, "delay": (late - early) / (2.0 * _DELAY_STEP_S)}
 
 
-def _wandering(h: Hypothesis, response: FloatArray, sd: float) -> FreeFormFit:
+def _wandering(h: Hypothesis, kind: str, response: FloatArray) -> FreeFormFit:
     """Evidence of a course times `response` (channel, frame, bin) beside `h`, whose parameters may move again.
 
     What wanders is noise at first; once it is out, the noise is smaller: both are found in turn. The noise is larger in
@@ -337,7 +334,8 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float) -> FreeFormFit:
     precision, pull = linear_priors(h, h.free)
     between = np.abs(data.frame_time[:, None] - data.frame_time)
     centre = np.eye(frames) - 1.0 / frames
-    priors = [centre @ ((ratio * sd) ** 2 * np.exp(-between / s)) @ centre for ratio in WANDER_RATIOS for s in WANDER_S]
+    sds = [ratio * WANDER_SD[kind] for ratio in WANDER_RATIOS]
+    priors = [centre @ (sd**2 * np.exp(-between / s)) @ centre for sd in sds for s in WANDER_S]
 
     def by_frame(x: FloatArray, noise: FloatArray) -> FloatArray:
         shape = data.channel_count, frames, data.bin_count
@@ -379,8 +377,29 @@ def _wandering(h: Hypothesis, response: FloatArray, sd: float) -> FreeFormFit:
         noise = after
     if best.residual is None or best.nats <= 0:
         return best
-    left, over = _bent(h, moved, response * best.coefficients[:, None], best.residual)
+    taken = response * best.coefficients[:, None] if kind != "delay" else _delayed(h, best.coefficients)
+    left, over = _bent(h, moved, taken, best.residual)
     return FreeFormFit(best.nats - over, left, best.coefficients)
+
+
+def _delayed(h: Hypothesis, delays: FloatArray) -> FloatArray:
+    """Change (channel, frame, bin) of the response by a delay (frame,) [s] of all channels in each frame."""
+    signals, out = h.on_grid(), np.zeros_like(h.predicted)
+    steps = delays / _DELAY_GRID_S
+    below = np.floor(steps)
+    for step in range(int(below.min()), int(below.max()) + 2):
+        weight = np.maximum(1.0 - np.abs(steps - step), 0.0)
+        if weight.any():
+            out += weight[:, None] * h.data.transform(h.recorded(*signals, _later(h, step * _DELAY_GRID_S)))
+    return out - h.predicted
+
+
+def _later(h: Hypothesis, delay: float) -> FloatArray:
+    """Values (parameter,) of the hypothesis with all channels recorded later by a delay [s]."""
+    values = h.values.copy()
+    for channel in h.data.channels:
+        values[INDEX[f"{channel}_delay"]] += delay
+    return values
 
 
 def _best_course(score: FloatArray, information: FloatArray, priors: Sequence[FloatArray]) -> tuple[FloatArray, float]:

@@ -63,6 +63,7 @@ QUANTUM_SCALE = 0.4
 RATE_NATS = 4.0
 """What a change of a rate costs [nats]: its time, one of some fifty."""
 
+_REMOVALS = 20  # rounds of outliers that are taken out, each of those that do not overlap
 _TAPS = 14  # of the filter pi, smeared: its order and what a filter of the recorder adds
 _NORMAL_SCALES = np.linspace(0.8, 2.0, 13)
 _STUDENT_SCALES, _STUDENT_DOF = np.arange(7, 13) / 10, np.array([2.5, 3, 4, 6, 9, 15, 30])
@@ -110,14 +111,15 @@ def sensor_outliers(h: Hypothesis) -> Outliers:
     found = robust_innovations(errors, data.bounds, data.warm_rows, raw)
     if found is None:
         return Outliers(-math.inf, nothing, np.zeros(0, np.int64), errors)
-    suspect = ~(_after_steps(data)[found.rows] | _lasting(found.z, max(3, LONGEST_S / data.dt)))
-    mixture, student, normal = tail_log_likelihoods(found.z[suspect])
+    single, places = outliers_alone(found.z, found.pi)
+    suspect = ~(_after_steps(data)[found.rows] | _lasting(single, places, max(3, LONGEST_S / data.dt)))
+    mixture, student, normal = tail_log_likelihoods(single[suspect])
     tails = max(mixture - max(student, normal) - MIXTURE_NATS, mixture - normal - HEAVY_NATS_PER_ROW * suspect.sum())
     additive, smear, at = additive_over_innovational(np.where(suspect, found.z, 0.0), found.pi, data.dt)
     if (found.pi**2).sum() <= COLOUR:
         additive = -math.inf
     if tails > additive:
-        smear, at = 0.0, np.flatnonzero(suspect & (np.abs(found.z) > SUSPECT))
+        smear, at = 0.0, np.flatnonzero(suspect & (np.abs(single) > SUSPECT))
     starts, flags = found.rows[at], nothing
     lasts = max(1, math.ceil(math.log(0.12) / math.log(smear))) if smear > 0 else 1
     for k in range(lasts):
@@ -192,6 +194,27 @@ def robust_innovations(
     return Innovations(residual / scale, rows, np.concatenate([[1.0], -coefficients[::-1]]), scale)
 
 
+def outliers_alone(z: FloatArray, pi: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Innovations `z` (innovation,) in which an additive outlier is one of them, at its place, and not all that the
+    filter `pi` (order + 1,) answers it with; and those places (innovation,).
+
+    Outliers are detected and what they add is taken out, until none is left (Chen and Liu 1993).
+    """
+    left, found = z.copy(), np.zeros(len(z))
+    pattern, taps = pi / np.sqrt((pi**2).sum()), len(pi)
+    for _ in range(_REMOVALS if len(z) > taps else 0):
+        sizes = np.correlate(left, pattern, "valid")
+        matched = np.abs(sizes)
+        largest = np.lib.stride_tricks.sliding_window_view(np.abs(left), taps).max(1)
+        additive = 0.5 * (matched**2 - largest**2) > SUSPECT_NATS
+        at = np.flatnonzero(additive & (matched > SUSPECT) & (matched == maximum_filter1d(matched, 2 * taps - 1)))
+        if not len(at):
+            break
+        found[at] += sizes[at]
+        left[at[:, None] + np.arange(taps)] -= sizes[at, None] * pattern
+    return np.clip(left + found, -CLIP, CLIP), found != 0
+
+
 def additive_over_innovational(z: FloatArray, pi: FloatArray, dt: float) -> tuple[float, float, IntArray]:
     """Nats of additive over innovational outliers in innovations `z` (innovation,), the smear, and their places.
 
@@ -244,9 +267,10 @@ def _after_steps(data: DriveData) -> BoolArray:
     return near if near.mean() <= 0.3 else np.zeros(len(step), bool)
 
 
-def _lasting(z: FloatArray, longest: float) -> BoolArray:
-    """Innovations (innovation,) in runs of large ones, at most one small one between, of more than `longest`."""
-    large = np.flatnonzero(np.abs(z) > 3.5)
+def _lasting(z: FloatArray, places: BoolArray, longest: float) -> BoolArray:
+    """Innovations (innovation,) in runs of large ones, at most one small one between, of more than `longest`; additive
+    outliers at `places` (innovation,) are large."""
+    large = np.flatnonzero((np.abs(z) > 3.5) | places)
     run = np.cumsum(np.diff(large, prepend=large[:1]) > 2)
     out = np.zeros(len(z), bool)
     out[large] = np.bincount(run)[run] > longest

@@ -18,6 +18,7 @@ from avtorch.gap.engine.free_forms import (
     COEFFICIENT_SD,
     FreeForm,
     _bent,
+    _delayed,
     _first_order_backwards,
     _moved,
     band_products,
@@ -234,6 +235,18 @@ def test_what_only_a_straight_line_promises_is_no_gain(lag: float) -> None:
     car = _moved(h, moves)
     np.testing.assert_allclose(left, h.data.measured - car.response())
     assert over == pytest.approx(max(log_likelihood(h.data, linear)[0] - car.log_likelihood, 0.0))
+
+
+def test_a_frame_that_is_late_is_simulated_so() -> None:
+    """Delays of whole steps of the grid, of which each frame has its own: the response, not its slope times them."""
+    h = _car(_lags)
+    late = np.where(np.arange(h.data.frame_count) % 2 == 0, 0.3, -0.2)
+    change = _delayed(h, late)
+    for first, delay in enumerate((0.3, -0.2)):
+        there = h.copy()
+        for channel in h.data.channels:
+            there[f"{channel}_delay"] += delay
+        np.testing.assert_allclose(change[:, first::2], (there.response() - h.predicted)[:, first::2], atol=1e-12)
 
 
 @pytest.mark.parametrize("channels", [("accel", "speed"), ("speed",), ("accel",)], ids="+".join)

@@ -162,6 +162,23 @@ def test_outliers_are_flagged_and_replaced(rotating_seed: int) -> None:
 
 
 @pytest.mark.statistical
+def test_outliers_on_a_smooth_error_are_flagged(rotating_seed: int) -> None:
+    """Six poles answer an outlier with seven large innovations in a row, longer than a lasting deviation: it is one."""
+    rng = np.random.default_rng(rotating_seed)
+    rows, smooth = 120 * RATE_HZ, np.poly([0.8] * 6)
+    places = _places(rng, 300, rows - 50, 60)
+    noise = 0.1 * NOISE_MPS2 * lfilter([1.0], smooth, rng.normal(size=rows))
+    spikes = np.zeros(rows)
+    spikes[places] = 20 * NOISE_MPS2 * rng.choice([-1, 1], 60)
+    data = _data(rng, 120.0, noise + spikes)
+    found = sensor_outliers(Hypothesis(data))
+    assert found.nats > log_odds()
+    # each is 200 innovations' scales
+    assert set(places) <= set(np.flatnonzero(found.flags))
+    assert found.flags.sum() <= 60 + BAR
+
+
+@pytest.mark.statistical
 def test_a_clean_accelerometer_has_none(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     for noise in (
