@@ -398,7 +398,10 @@ def _weights(x: Examined, examined: list[Examined]) -> Iterator[Weight]:
             labels = [(names or None, -UNKNOWN_NATS)] + [
                 (label, worth + shape_log_odds(c.relative, c.nats, h.effects)) for label, worth in labels
             ]
-            if names and h.force is None and c.nats > 0:
+            if c.form == "delay" and "command_hold" in names:
+                # losses that are too short to be found one by one delay each frame by their mean: no other cause
+                labels[0] = (names, 0.0)
+            elif names and h.force is None and c.nats > 0:
                 # or one cause without a name does it all, and the names are but terms of its description
                 labels.append((None, -UNKNOWN_NATS + (each - TRIED_NATS) * count))
         total, kinds = dict(c.total), [slow for slow in SLOW if slow in c.total]
