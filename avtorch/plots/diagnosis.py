@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator, PercentFormatter
 
-from avtorch.arrays import BoolArray, FloatArray, IntArray
+from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.attribution import UNITS, Axis
@@ -18,6 +18,7 @@ from avtorch.gap.result.counted_rows import HORIZON_S
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.hypotheses import Candidate
 from avtorch.gap.result.traces import Traces
+from avtorch.gap.simulator.force_table import ForceTable, ResistanceCurve
 from avtorch.io.clock import time_label
 from avtorch.plots.style import (
     BLACK,
@@ -221,51 +222,35 @@ def shrinkage_figure(found: Diagnosis) -> Figure:
     return figure
 
 
-def _force_contours(ax: Axes, found: Diagnosis) -> None:
+def _force_contours(ax: Axes, traces: Traces | None, table: ForceTable) -> None:
     """Force beyond K u [m/s²] of the force map over speed and command; hatched, what was not driven: there only its
     smoothness speaks, and far from the drive it goes back to K u."""
-    form = found.free_form
-    assert form is not None
-    u, v, table = form.knots_u, form.knots_v, form.at.table
-    most = max(float(np.abs(table).max()), 1e-6)
-    drawn = ax.contourf(v, u, table, levels=np.linspace(-most, most, 13), cmap="RdBu_r")
+    u, v, force = (np.array(x) for x in (table.command_mps2, table.speed_mps, table.force_mps2))
+    most = max(float(np.abs(force).max()), 1e-6)
+    drawn = ax.contourf(v, u, force, levels=np.linspace(-most, most, 13), cmap="RdBu_r")
     ax.figure.colorbar(drawn, ax=ax, label="force beyond K u [m/s²]", format="%.2g")
-    across, along, driven = _driven_cells(found)
-    # contourf takes values in the middle of cells
-    middle = [0.5 * (x[1:] + x[:-1]) for x in (across, along)]
-    ax.contourf(*middle, (~driven).T.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
+    ends = v[[0, -1]], u[[0, -1]]
+    if traces is not None and traces.speed is not None:
+        ends = np.clip([traces.speed.min(), traces.speed.max()], *ends[0]), ends[1]
+        edges = [np.linspace(low, high, _CELLS + 1) for low, high in ends]
+        driven = np.histogram2d(traces.speed, traces.command, bins=edges)[0] > 0
+        # contourf takes values in the middle of cells
+        middle = [0.5 * (x[1:] + x[:-1]) for x in edges]
+        ax.contourf(*middle, (~driven).T.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
     ax.axhline(0.0, color=GREY, lw=0.8)
-    ax.set(xlabel="speed [m/s]", ylabel="command [m/s²]", xlim=across[[0, -1]], ylim=along[[0, -1]])
+    ax.set(xlabel="speed [m/s]", ylabel="command [m/s²]", xlim=ends[0], ylim=ends[1])
     ax.grid(visible=False)
 
 
-def _resistance_line(ax: Axes, found: Diagnosis) -> None:
+def _resistance_line(ax: Axes, traces: Traces | None, curve: ResistanceCurve) -> None:
     """The resistance of the free form [m/s²] over speed, and where the middle nine tenths of the drive lie; where
     nothing was driven it is a line."""
-    form = found.free_form
-    assert form is not None
-    ax.plot(form.knots_v, form.at.curve, color=BLUE, marker=".")
-    speed = None if found.traces is None else found.traces.speed
-    if speed is not None:
-        low, high = np.quantile(speed, (0.05, 0.95))
+    ax.plot(curve.speed_mps, curve.force_mps2, color=BLUE, marker=".")
+    if traces is not None and traces.speed is not None:
+        low, high = np.quantile(traces.speed, (0.05, 0.95))
         ax.axvspan(float(low), float(high), color=GREY, alpha=0.15, lw=0)
     ax.axhline(0.0, color=BLACK, lw=0.8)
     ax.set(xlabel="speed [m/s]", ylabel="acceleration [m/s²]")
-
-
-def _driven_cells(found: Diagnosis) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Edges of cells in speed [m/s] and command [m/s²], and whether the drive was in each (speed, command)."""
-    form, traces = found.free_form, found.traces
-    assert form is not None
-    ends = [form.knots_v[[0, -1]], form.knots_u[[0, -1]]]
-    speed = None if traces is None else traces.speed
-    if speed is not None:
-        ends[0] = np.clip([speed.min(), speed.max()], *ends[0])
-    edges = [np.linspace(low, high, _CELLS + 1) for low, high in ends]
-    if traces is None or speed is None:
-        return edges[0], edges[1], np.ones((_CELLS, _CELLS), bool)
-    counts = np.histogram2d(speed, traces.command, bins=edges)[0]
-    return edges[0], edges[1], counts > 0
 
 
 @styled
@@ -274,17 +259,14 @@ def free_form_figure(found: Diagnosis) -> Figure:
 
     Raises `InputError` where it carries nothing.
     """
-    form = found.free_form
-    if form is None or not form.sizes.any:
+    if not found.free_form:
         raise InputError("free_form: the repaired simulator carries nothing without a name")
-    panels = [
-        draw
-        for draw, size in ((_force_contours, form.sizes.table), (_resistance_line, form.sizes.resistance))
-        if size > 0
-    ]
-    figure, axes = panels_of(len(panels), 3.3, wide=4.3 * len(panels))
-    for ax, draw in zip(axes, panels, strict=True):
-        draw(ax, found)
+    figure, axes = panels_of(len(found.free_form), 3.3, wide=4.3 * len(found.free_form))
+    for ax, part in zip(axes, found.free_form, strict=True):
+        if isinstance(part, ForceTable):
+            _force_contours(ax, found.traces, part)
+        else:
+            _resistance_line(ax, found.traces, part)
     return figure
 
 

@@ -16,6 +16,7 @@ from avtorch.gap.result.budget import percent as share_of
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.manoeuvres import manoeuvres
 from avtorch.gap.result.residuals import BLOCK_S, BinnedMeans, Residuals
+from avtorch.gap.simulator.force_table import ForceTable
 from avtorch.plots import diagnosis as drawings
 from avtorch.plots import drive
 from avtorch.report.diagnosis_tables import (
@@ -180,16 +181,16 @@ def _budget(found: Diagnosis) -> Picture | None:
 
 
 def _free_form(found: Diagnosis) -> Picture | None:
-    form = found.free_form
-    if form is None or not form.sizes.any:
+    if not found.free_form:
         return None
-    columns, values = ["speed [m/s]"], [form.knots_v]
-    if form.sizes.table > 0:
-        columns += [f"force beyond K u at {x:.2g} m/s² [m/s²]" for x in form.knots_u]
-        values += list(form.at.table)
-    if form.sizes.resistance > 0:
-        columns.append("resistance [m/s²]")
-        values.append(form.at.curve)
+    columns, values = ["speed [m/s]"], [found.free_form[0].speed_mps]
+    for part in found.free_form:
+        if isinstance(part, ForceTable):
+            columns += [f"force beyond K u at {x:.2g} m/s² [m/s²]" for x in part.command_mps2]
+            values += part.force_mps2
+        else:
+            columns.append("resistance [m/s²]")
+            values.append(part.force_mps2)
     rows = tuple(tuple(f"{x:.3g}" for x in row) for row in zip(*values, strict=True))
     return picture_of(
         "free_form",

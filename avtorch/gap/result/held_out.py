@@ -183,7 +183,7 @@ def _apart(full: Hypothesis, scored: Sequence[Scores], blocks: Blocks, free: Fit
         if beside is None:
             out[family] = _taught(rest, blocks).scores(blocks)
         else:
-            rest["T_L"] = float(np.clip(beside.form.T_L * rest["T_L"] / full["T_L"], *rest.limits("T_L")))
+            rest["T_L"] = float(np.clip(beside.fit.T_L * rest["T_L"] / full["T_L"], *rest.limits("T_L")))
             out[family] = _with_form(beside, rest, blocks)
     if free is not None and "force map" not in out:
         out["force map"] = scored[-2]
