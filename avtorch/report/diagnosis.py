@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -15,7 +15,8 @@ from avtorch.gap.result import sentences
 from avtorch.gap.result.budget import percent as share_of
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.manoeuvres import manoeuvres
-from avtorch.gap.result.residuals import BLOCK_S, BinnedMeans, Residuals
+from avtorch.gap.result.residuals import BLOCK_S, BinnedMeans, Correlation, binned_means, correlation, spectrum, usual
+from avtorch.gap.result.traces import Traces
 from avtorch.gap.simulator.force_table import ForceTable
 from avtorch.plots import diagnosis as drawings
 from avtorch.plots import drive
@@ -368,27 +369,22 @@ def _manoeuvres(found: Diagnosis) -> Section:
 # what is left of the gap -------------------------------------------------------------------------------------------
 def _residuals(found: Diagnosis) -> Section:
     """The residuals of a diagnosis; nothing where there is too little to show."""
-    title = "What is left: residuals"
-    if found.traces is None or len(found.traces.time) < _LEAST:
+    title, traces = "What is left: residuals", found.traces
+    if traces is None or len(traces.time) < _LEAST:
         return Section(title)
-    left = drive.residuals_of(found)
-    if len(left.time) < _LEAST:
-        return Section(title)
-    both = drive.sides(found, left)
-    against: list[tuple[drive.Against, FloatArray]] = [("command", left.command)]
-    if left.speed is not None:
-        against.append(("speed", left.speed))
-    pictures = [_residual_against(found, left, both, name, axis) for name, axis in against]
+    both = drive.residuals_of(found)
     last = list(both.values())[-1]
+    pictures = [_residual_against(found, traces, both, name, axis) for name, axis in _axes(traces)]
+    outside = correlation(traces, last)
     pictures.append(
         picture_of(
             "residual-correlation",
             drive.residual_figure(found, "earlier commands"),
-            caption=f"Against earlier commands: a residual beyond ±{left.correlation(last).band:.2f}, 99 % of what "
+            caption=f"Against earlier commands: a residual beyond ±{outside.band:.2f}, 99 % of what "
             "chance does, follows the command in a way that the simulator does not.",
         )
     )
-    if left.spectrum(last) is not None:
+    if spectrum(traces, last) is not None:
         pictures.append(
             picture_of(
                 "residual-frequency",
@@ -396,24 +392,24 @@ def _residuals(found: Diagnosis) -> Section:
                 caption="Against frequency: power averaged over windows of 20 s; bands are 90 %.",
             )
         )
-    return Section(title, _what_is_left(left, both), (_residual_over_time(found, left, both),), tuple(pictures))
+    said = _what_is_left(traces, both, outside)
+    return Section(title, said, (_residual_over_time(found, traces, both),), tuple(pictures))
 
 
-def _what_is_left(left: Residuals, both: Mapping[str, FloatArray]) -> tuple[str, ...]:
+def _axes(traces: Traces) -> list[tuple[Literal["command", "speed"], FloatArray]]:
+    return [("command", traces.command), *([] if traces.speed is None else [("speed", traces.speed)])]
+
+
+def _what_is_left(traces: Traces, both: Mapping[str, FloatArray], outside: Correlation) -> tuple[str, ...]:
     what = (
         "Measured acceleration less that of a rollout over the whole drive"
-        if left.channel == "accel"
+        if "accel" in traces.channels
         else "Slope over 1 s of the measured speed less that of a rollout over the whole drive"
     )
     sizes = [f"{np.sqrt(np.mean(residual**2)):.2g} m/s² {label}" for label, residual in both.items()]
     said = [f"{what}: {', '.join(sizes)} (root mean square)."]
-    judged = list(both.values())[-1]
-    shows = [
-        name
-        for name, axis in (("command", left.command), ("speed", left.speed))
-        if axis is not None and _apart(left.against(axis, judged))
-    ]
-    outside = left.correlation(judged)
+    last = list(both.values())[-1]
+    shows = [name for name, axis in _axes(traces) if _apart(binned_means(traces, axis, last))]
     late = outside.lag[(outside.lag >= 0) & (np.abs(outside.value) > outside.band)]
     who = "The simulator with what was named" if len(both) > 1 else "The baseline simulator"
     if shows:
@@ -431,17 +427,17 @@ def _apart(bins: BinnedMeans) -> bool:
     return int(((bins.low > 0) | (bins.high < 0))[known].sum()) > max(2, 0.3 * int(known.sum()))
 
 
-def _residual_over_time(found: Diagnosis, left: Residuals, both: Mapping[str, FloatArray]) -> Picture:
+def _residual_over_time(found: Diagnosis, traces: Traces, both: Mapping[str, FloatArray]) -> Picture:
     columns = ("part of the drive [s]", *(f"{what} {label} [m/s²]" for label in both for what in ("mean", "SD")))
     rows = [
         (
-            f"{left.time[part[0]]:.0f} to {left.time[part[-1]]:.0f}",
+            f"{traces.time[part[0]]:.0f} to {traces.time[part[-1]]:.0f}",
             *(f"{size:.3f}" for residual in both.values() for size in (residual[part].mean(), residual[part].std())),
         )
-        for part in np.array_split(np.arange(len(left.time)), _PARTS)
+        for part in np.array_split(np.arange(len(traces.time)), _PARTS)
     ]
     judged = list(both.values())[-1]
-    beyond = f"{100 * float(np.mean(np.abs(judged) > left.usual(judged))):.1f} %"
+    beyond = f"{100 * float(np.mean(np.abs(judged) > usual(judged))):.1f} %"
     return picture_of(
         "residual-time",
         drive.residual_time_figure(found),
@@ -452,12 +448,12 @@ def _residual_over_time(found: Diagnosis, left: Residuals, both: Mapping[str, Fl
 
 
 def _residual_against(
-    found: Diagnosis, left: Residuals, both: Mapping[str, FloatArray], name: drive.Against, axis: FloatArray
+    found: Diagnosis, traces: Traces, both: Mapping[str, FloatArray], name: drive.Against, axis: FloatArray
 ) -> Picture:
     unit = "m/s²" if name == "command" else "m/s"
     rows = []
     for label, residual in both.items():
-        bins = left.against(axis, residual)
+        bins = binned_means(traces, axis, residual)
         for place, mean, low, high in zip(bins.place, bins.mean, bins.low, bins.high, strict=True):
             within = f" ({low:.3f} to {high:.3f})" if np.isfinite(low) else ""
             rows.append((f"{place:.3g} {unit}", label, f"{mean:.3f}{within}"))
