@@ -44,9 +44,11 @@ def budget_bars(ax: Axes, budget: Budget) -> Axes:
 
     Without any part all of the gap is unexplained, so the bars divide the error: what is unexplained, and noise.
     """
-    rows = _bars_of(budget)
+    surely = {part.name for part in budget.parts if part.probability >= LIKELY}
+    colours = {"noise": GREY, "unexplained": ORANGE if budget.parts or budget.unexplained.material else SKY}
     begun, reach = 0.0, 1.0
-    for i, (_, share, colour) in enumerate(rows):
+    for i, (name, share) in enumerate(budget.shares.items()):
+        colour = colours.get(name, BLUE if name in surely else SKY)
         ax.barh(i, share.mean, left=begun, color=colour, height=0.64)
         ax.plot([begun + share.q05, begun + share.q95], [i, i], color=BLACK, lw=1.0)
         ax.text(max(begun + share.q95, begun + share.mean) + 0.012, i, percent(share.mean), va="center", fontsize=9)
@@ -54,27 +56,16 @@ def budget_bars(ax: Axes, budget: Budget) -> Axes:
             ax.plot([begun, begun], [i - 1, i], color=GREY, lw=0.6)
         reach = max(reach, begun + share.q95)  # a whisker may end beyond the whole
         begun += share.mean
-    ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+    ax.set_yticks(range(len(budget.shares)), list(budget.shares))
     ax.set(
         xlabel=f"share of the {'gap' if budget.parts else 'error'} in held-out {budget.horizon_s:.3g} s rollouts",
         xlim=(0, reach * 1.12),
-        ylim=(len(rows) - 0.4, -0.6),
+        ylim=(len(budget.shares) - 0.4, -0.6),
     )
     ax.set_xticks(_UP_TO_ONE)
     ax.xaxis.set_major_formatter(PercentFormatter(1.0, 0, " %"))
     ax.grid(axis="y", visible=False)
     return ax
-
-
-def _bars_of(budget: Budget) -> list[tuple[str, Quantity, str]]:
-    """Names, shares and colours."""
-    if budget.parts:
-        named = [(p.name, p.share, BLUE if p.probability >= LIKELY else SKY) for p in budget.parts]
-        rest = budget.unexplained
-        carried = [] if rest.carried is None else [("a force without a name", rest.carried, SKY)]
-        return [*named, *carried, ("unexplained", rest.beyond_carried, ORANGE)]
-    rest, noise = budget.error
-    return [("unexplained", rest, ORANGE if budget.unexplained.material else SKY), ("noise", noise, GREY)]
 
 
 _UP_TO_ONE = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -113,7 +104,7 @@ def budget_figure(found: Diagnosis) -> Figure:
     """The budget of the gap. Raises `InputError` where the diagnosis has none."""
     if found.budget is None:
         raise InputError("budget: the diagnosis has none to draw; its drives are too short to hold out blocks")
-    figure, (ax,) = panels_of(1, 0.9 + 0.36 * len(_bars_of(found.budget)))
+    figure, (ax,) = panels_of(1, 0.9 + 0.36 * len(found.budget.shares))
     budget_bars(ax, found.budget)
     return figure
 

@@ -151,31 +151,24 @@ def _budget(found: Diagnosis) -> Picture | None:
     budget = found.budget
     if budget is None:
         return None
-    (rest, noise), over = budget.error, f"the squared error of {budget.horizon_s:.3g} s simulations"
+    rest, over = budget.unexplained, f"the squared error of {budget.horizon_s:.3g} s simulations"
+    told = ", ".join(f"{name} {share_of(share.mean)}" for name, share in budget.shares.items())
     if budget.parts:
-        rest_of = budget.unexplained
-        shares = [(part.name, part.share) for part in budget.parts]
-        shares += [] if rest_of.carried is None else [("a force without a name", rest_of.carried)]
-        shares += [("unexplained", rest_of.beyond_carried)]
-        told = ", ".join(f"{name} {100 * share.mean:.0f} %" for name, share in shares)
         says = f"Bars of what each effect contributes to the gap: {told}."
         caption = (
             f"A share is what an effect takes off {over}, above that of noise alone, on parts of the drive not used "
             "for fitting; effects are added in the order shown. Black lines: 90 % intervals."
-            + ("" if rest_of.carried is None else " The repaired simulator carries the force that has no name.")
+            + ("" if rest.carried is None else " The repaired simulator carries the force that has no name.")
         )
     else:
-        says = (
-            "Bars of what the error of the baseline simulator consists of: "
-            f"unexplained {share_of(rest.mean)}, noise {share_of(noise.mean)}."
-        )
-        counts = "What is unexplained does not count: it is too little, or not sure." if rest.mean else ""
-        counts = f"{counts} The error is {budget.unexplained.rest(budget.material)}.".strip()
+        says = f"Bars of what the error of the baseline simulator consists of: {told}."
+        counts = "What is unexplained does not count: it is too little, or not sure." if budget.left_above_noise else ""
+        counts = f"{counts} The error is {rest.rest(budget.material)}.".strip()
         caption = (
             f"Shares of {over} by the baseline, on parts of the drive not used for fitting. Noise is what commands, "
             "speed and place do not predict; what is unexplained is reproducible, and no known effect reduces it. "
             "Black lines: 90 % intervals."
-            f"{'' if budget.unexplained.material else f' {counts}'}"
+            f"{'' if rest.material else f' {counts}'}"
         )
     table = budget_table(budget, found.log.epochs_s[0])
     return picture_of("budget", drawings.budget_figure(found), table, says=says, caption=caption, opened=True)

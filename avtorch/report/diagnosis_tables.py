@@ -12,7 +12,7 @@ from avtorch.gap.quantity import Quantity, unit_of, words_of
 from avtorch.gap.result import budget as budget_parts
 from avtorch.gap.result import sentences
 from avtorch.gap.result.attribution import UNITS
-from avtorch.gap.result.budget import Budget
+from avtorch.gap.result.budget import UNNAMED, Budget, Part
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.gap_size import Shrinkage
 from avtorch.gap.result.manoeuvres import Manoeuvre
@@ -36,23 +36,15 @@ def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
     several = any(len(part.alias_set) > 1 for part in (*budget.parts, *budget.chance))
     chance = "probability of it or an alias" if several else "probability"
     columns = ("effect", share, chance, "parameters (90 %)", "aliases, not told apart")
-    named = [(part, percent(part.share)) for part in budget.parts]
-    rows = []
-    for part, share in [*named, *((part, "by chance, part of the noise") for part in budget.chance)]:
+    places, rows = budget.unexplained.places(epoch_s), []
+    for part in (*budget.parts, *budget.chance):
+        share = percent(part.share) if isinstance(part, Part) else "by chance, part of the noise"
         parameters = _parameters(part.parameters or {}) + ([] if part.plausible else [_IMPLAUSIBLE])
         alike = ", ".join(name for name in part.alias_set if name != part.name)
         rows.append((part.name, share, sentences.number(part.probability), "; ".join(parameters), alike))
-    places, (rest, noise) = budget.unexplained.places(epoch_s), budget.error
-    if budget.parts:
-        carried = budget.unexplained.carried
-        if carried is not None:
-            rows.append(("a force without a name", percent(carried), "", "in the repaired simulator", ""))
-        rows.append(("unexplained", percent(budget.unexplained.beyond_carried), "", places, ""))
-    else:
-        rows += [
-            ("unexplained", percent(rest), "", places, ""),
-            ("noise", percent(noise), "", "", ""),
-        ]
+    about = {UNNAMED: "in the repaired simulator", "unexplained": places}
+    others = {name: share for name, share in budget.shares.items() if name not in {part.name for part in budget.parts}}
+    rows += [(name, percent(share), "", about.get(name, ""), "") for name, share in others.items()]
     return Table("The gap's budget", columns, tuple(rows), numeric=(chance,))
 
 

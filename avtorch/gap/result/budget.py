@@ -51,6 +51,8 @@ MATERIAL = 0.03
 """Share from which something counts, unless a user says otherwise: a part of the bare baseline's squared error, what is
 unexplained of the gap."""
 
+UNNAMED = "a force without a name"
+"""What the repaired simulator carries beside the named effects, in a table."""
 _UNNAMED = "a force of command and speed without a name"
 _NOTHING = 1e-3  # of the energy before, below which free runs show no gap
 _SIZES = 48  # draws of the size of a family
@@ -235,6 +237,16 @@ class Budget:
         return Quantity(mean, 0.0, low, high), Quantity(1 - mean, 0.0, 1 - high, 1 - low)
 
     @property
+    def shares(self) -> dict[str, Quantity]:
+        """Of the gap: of each part, of a force without a name, and of what is unexplained; without any part those of
+        `error`."""
+        if not self.parts:
+            return dict(zip(("unexplained", "noise"), self.error, strict=True))
+        carried, rest = self.unexplained.carried, self.unexplained.beyond_carried
+        unnamed = {} if carried is None else {UNNAMED: carried}
+        return {**{part.name: part.share for part in self.parts}, **unnamed, "unexplained": rest}
+
+    @property
     def verdict(self) -> tuple[str, ...]:
         """`names`; without any `("unknown",)` where something material is reproducible, else `("none",)`."""
         return self.names or (("unknown",) if self.unexplained.material else ("none",))
@@ -350,7 +362,7 @@ def budget_of(
     free run foretells them. `material`: share of the gap from which what is unexplained is said to matter, where
     nothing is named by what the evidence says: with `unknown` it does, with `none` it does not.
     """
-    energy, floor = _energies(held)
+    energy, floor = np.stack([held.energy(x) for x in held.steps]), held.energy(held.floor)  # (model, block), (block,)
     draws = _shares(energy, floor, seed)
     shares = {name: draws[:, k] for k, name in enumerate(held.names)}
     by_effect = posterior.by_effect()
@@ -475,13 +487,6 @@ def least_visible(h: Hypothesis, among: Sequence[str]) -> Mapping[str, tuple[flo
 
 
 # inside ---------------------------------------------------------------------------------------------------------------
-def _energies(held: HeldOut) -> tuple[FloatArray, FloatArray]:
-    """Energies (model, block) of the chain and (block,) of the floor, each channel over its own floor."""
-    levels, bottom = np.stack([x.squares for x in held.steps]), held.floor.squares  # model, channel, block
-    scale = np.maximum(bottom.mean(1), 1e-12)[:, None]
-    return (levels / scale).mean(1), (bottom / scale).mean(0)
-
-
 def _levels(held: HeldOut) -> list[ChannelError]:
     """Root mean squares before, at the floor and left, a channel."""
     three = np.stack([x.squares.sum(1) for x in (held.steps[0], held.floor, held.steps[-1])])
@@ -590,9 +595,7 @@ def _takes_off(held: HeldOut, family: str, seed: int) -> Quantity | None:
     without = held.apart.get(family)
     if without is None:
         return None
-    before, after, floor = (x.squares for x in (held.steps[0], held.steps[-1], held.floor))
-    scale = np.maximum(floor.mean(1), 1e-12)[:, None]
-    before, after, less, floor = ((x / scale).mean(0) for x in (before, after, without.squares, floor))
+    before, after, less, floor = (held.energy(x) for x in (held.steps[0], held.steps[-1], without, held.floor))
     whole = np.maximum(resampled(before - floor, seed), 1e-9)
     draws = np.clip(resampled(less - after, seed) / whole, 0.0, 1.0)
     return Quantity.of_resampled(draws[0], draws)

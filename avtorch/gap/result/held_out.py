@@ -110,6 +110,11 @@ class HeldOut:
         """The rival's, no higher than the last step in any channel."""
         return self.rival.no_worse_than(self.steps[-1])
 
+    def energy(self, scores: Scores) -> FloatArray:
+        """Squared errors (block,) of free runs, each channel over its own floor, averaged over the channels."""
+        scale = np.maximum(self.floor.squares.mean(1), 1e-12)[:, None]
+        return (scores.squares / scale).mean(0)
+
     def free_gains(self, *, named: bool) -> bool:
         """Whether the free form lowers the errors of free runs, against the baseline and, where they are `named`,
         against names alone; its size was chosen by other ways of leaving out."""
