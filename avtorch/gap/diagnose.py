@@ -158,9 +158,8 @@ def diagnose(
     found = None if named_only else fitted_form(repaired.examined.hypothesis, base, none)
     free = found if found is not None and found.earns_its_place(named=named) else None
     visited = [h for h in inference.search.visited.values() if h.force is None]
-    held = held_out_errors(none, repaired.examined.hypothesis, visited, free)
-    if held is not None and free is not None and not held.free_gains(named=named):
-        free, held = None, held.without_free()
+    held = held_out_errors(none, repaired.examined.hypothesis, visited, free, named=named)
+    free = free if held is None or held.free else None
     lag_and_gain, assumed = base_quantities(none, seed)
     alone = next(x for x in average.examined if x.hypothesis is none)
     simulator = plant([], baseline=plant_of(none, base), sigma=alone.compositions[0].slow.process_noise)

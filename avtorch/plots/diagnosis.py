@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator, PercentFormatter
 
-from avtorch.arrays import FloatArray, IntArray
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.attribution import UNITS, Axis
@@ -78,18 +78,16 @@ def traces_of(found: Diagnosis) -> Traces:
     return found.traces
 
 
-def _liveliest(time: FloatArray, stretch: IntArray, size: FloatArray, seconds: float) -> slice:
+def _liveliest(traces: Traces, size: FloatArray, seconds: float) -> slice:
     """The window within one stretch in which `size` (row,) is largest."""
-    best, worth = slice(0, len(time)), -1.0
-    for number in np.unique(stretch):
-        rows = np.flatnonzero(stretch == number)
-        step = float(np.median(np.diff(time[rows]))) if len(rows) > 1 else 1.0
-        width = min(len(rows), max(2, round(seconds / step)))
+    best, worth = slice(0, len(size)), -1.0
+    for rows in traces.stretches:
+        width = min(len(rows), max(2, round(seconds / traces.step)))
         total = np.concatenate([[0.0], np.cumsum(size[rows])])
-        sums = total[width:] - total[:-width]
+        sums = (total[width:] - total[:-width]) / width
         first = int(sums.argmax())
-        if float(sums[first]) / width > worth:
-            best, worth = slice(int(rows[first]), int(rows[first]) + width), float(sums[first]) / width
+        if sums[first] > worth:
+            best, worth = slice(int(rows[first]), int(rows[first]) + width), float(sums[first])
     return best
 
 
@@ -123,7 +121,7 @@ def road_figure(found: Diagnosis) -> Figure:
     of_speed = traces.channels[k] == "speed"
     # beyond the horizon a simulated speed may be anywhere
     seconds = min(_SECONDS, HORIZON_S) if of_speed else _SECONDS
-    inside = _liveliest(traces.time, traces.stretch, np.abs(traces.before[k] - traces.after[k]), seconds)
+    inside = _liveliest(traces, np.abs(traces.before[k] - traces.after[k]), seconds)
     measured, before, after = (x[k][inside] for x in (traces.measured, traces.before, traces.after))
     if of_speed:  # a rollout begun at the measured speed
         before, after = (x + measured[0] - x[0] for x in (before, after))

@@ -79,10 +79,7 @@ class DriveTime:
 def drive_time(found: Diagnosis) -> DriveTime:
     """The axis of the whole drive. Raises `InputError` where there are no traces."""
     traces = traces_of(found)
-    time, new = traces.time, np.flatnonzero(np.diff(traces.time) < 0) + 1
-    number = np.zeros(len(time), int)
-    number[new] = 1
-    number = np.cumsum(number)
+    time, number = traces.time, traces.log
     apart = _LOGS_APART * float(sum(time[number == n].max() for n in np.unique(number)))
     begins = [0.0]
     for n in range(int(number[-1])):

@@ -139,11 +139,7 @@ def _rest(found: Diagnosis) -> tuple[str, ...]:
 def _words(found: Diagnosis) -> list[str]:
     told = [line for line in sentences.budget(found) if line not in _rest(found)]
     lines = [*sentences.tested(found), *told, found.verdict.why, sentences.aliases(found)]
-    lines += [*sentences.onset(found), *sentences.shrinkage(found)]
-    if found.setting is not None:
-        why = str(found.setting["why"])
-        lines.append(why if why.startswith("Nothing to set") else f"To set: {why}")
-    return lines
+    return [*lines, *sentences.onset(found), *sentences.shrinkage(found), *sentences.to_set(found)]
 
 
 def _budget(found: Diagnosis) -> Picture | None:

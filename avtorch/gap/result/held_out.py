@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -115,19 +115,6 @@ class HeldOut:
         scale = np.maximum(self.floor.squares.mean(1), 1e-12)[:, None]
         return (scores.squares / scale).mean(0)
 
-    def free_gains(self, *, named: bool) -> bool:
-        """Whether the free form lowers the errors of free runs, against the baseline and, where they are `named`,
-        against names alone; its size was chosen by other ways of leaving out."""
-        before = self.steps[0].squares.sum(1)
-        now, names = (float((x.squares.sum(1) / before).mean()) for x in (self.steps[-1], self.steps[-2]))
-        return self.free and now < (min(names, 1.0) if named else 1.0)
-
-    def without_free(self) -> HeldOut:
-        """The same chain without its free form."""
-        if not self.free:
-            return self
-        return replace(self, steps=self.steps[:-1], free=False, apart={})
-
     @property
     def frame_rows(self) -> FloatArray:
         """Rows (block,) that the densities are of: one hop a frame."""
@@ -136,13 +123,13 @@ class HeldOut:
 
 
 def held_out_errors(
-    base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis] = (), free: FittedForm | None = None
+    base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis], free: FittedForm | None, *, named: bool
 ) -> HeldOut | None:
     """The scores of nested hypotheses from `base` to `full`, fitted to all blocks; fits among `visited` are taken as
     they are.
 
-    `free`: a form beside the last, which the repaired simulator carries: what it leaves is the last step. None where
-    the drives are too short for `FEWEST` blocks.
+    `free`: a form beside the last, `named` or not, which the repaired simulator carries where it `gains`: what it
+    leaves is the last step. None where the drives are too short for `FEWEST` blocks.
     """
     data = full.data
     blocks = Blocks.of(data)
@@ -155,7 +142,9 @@ def held_out_errors(
     found = [black_box(x.hypothesis, x.residuals, blocks) for x in ends]
     rival, ceiling = (x.scores(blocks, beside) for x, beside in zip(ends, found, strict=True))
     if free is not None:
-        steps.append(_with_form(free, free.lagged, blocks))
+        carried = _with_form(free, free.lagged, blocks)
+        free = free if gains(carried, steps[0], steps[-1] if named else None) else None
+        steps += [] if free is None else [carried]
     return HeldOut(
         chain=tuple(chain),
         blocks=blocks,
@@ -167,6 +156,14 @@ def held_out_errors(
         free=free is not None,
         apart=_apart(fitted[-1].hypothesis, steps, blocks, free),
     )
+
+
+def gains(carried: Scores, base: Scores, named: Scores | None) -> bool:
+    """Whether a free form lowers the errors of free runs, against the baseline and against names alone, where there are
+    any; its size was chosen by other ways of leaving out."""
+    others = [x for x in (base, named) if x is not None]
+    now, *than = (float((x.squares.sum(1) / base.squares.sum(1)).mean()) for x in (carried, *others))
+    return now < min(than)
 
 
 def _apart(full: Hypothesis, scored: Sequence[Scores], blocks: Blocks, free: FittedForm | None) -> dict[str, Scores]:
