@@ -13,7 +13,7 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.attribution import UNITS, Axis
-from avtorch.gap.result.budget import LIKELY, Budget, percent
+from avtorch.gap.result.budget import UNNAMED, Budget, percent
 from avtorch.gap.result.counted_rows import HORIZON_S
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.hypotheses import Candidate
@@ -44,11 +44,11 @@ def budget_bars(ax: Axes, budget: Budget) -> Axes:
 
     Without any part all of the gap is unexplained, so the bars divide the error: what is unexplained, and noise.
     """
-    surely = {part.name for part in budget.parts if part.probability >= LIKELY}
-    colours = {"noise": GREY, "unexplained": ORANGE if budget.parts or budget.unexplained.material else SKY}
+    rest = ORANGE if budget.parts or budget.unexplained.material else SKY
+    colours = {"noise": GREY, "unexplained": rest, UNNAMED: SKY}
     begun, reach = 0.0, 1.0
     for i, (name, share) in enumerate(budget.shares.items()):
-        colour = colours.get(name, BLUE if name in surely else SKY)
+        colour = colours.get(name, BLUE)
         ax.barh(i, share.mean, left=begun, color=colour, height=0.64)
         ax.plot([begun + share.q05, begun + share.q95], [i, i], color=BLACK, lw=1.0)
         ax.text(max(begun + share.q95, begun + share.mean) + 0.012, i, percent(share.mean), va="center", fontsize=9)

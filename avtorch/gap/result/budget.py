@@ -221,8 +221,8 @@ class Budget:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Causes that are more likely there than not: parts, the largest first, then those that chance decides."""
-        return tuple(x.name for x in (*self.parts, *self.chance) if x.probability >= LIKELY)
+        """Causes that are named: parts, the largest first, then those that chance decides."""
+        return tuple(x.name for x in (*self.parts, *self.chance))
 
     @property
     def left_above_noise(self) -> float:
@@ -258,58 +258,47 @@ class Budget:
 
     def __str__(self) -> str:
         """What a person reads first."""
-        if self.names:
-            return self._sentence(lead="")
-        takes_off, rest = f"{_UNNAMED} takes off {percent(self._takes_off)} of", self.unexplained.rest(self.material)
-        if self.unexplained.material:
-            return f"No known effect explains the gap{f', but {takes_off} it' if self._takes_off else ''}."
-        if not self._takes_off and rest == "noise":
-            return "Nothing material is missing."
-        return f"No known effect is missing; {f'{takes_off} the gap' if self._takes_off else f'the error is {rest}'}."
+        return self.said()
 
-    def beside_its_name(self) -> str:
-        """As `str()`, where the sentence before has told the one part that is named."""
-        if len(self.names) != 1 or len(self.parts) != 1:
-            return str(self)
-        return self._sentence(lead=f"That is {percent(self.parts[0].share.mean)} of the gap")
+    def said(self, *, told: bool = False) -> str:
+        """The parts and the force without a name that the repaired simulator carries, the largest first, small ones by
+        their names alone; `told`: the sentence before has told the one part that there is."""
+        unnamed, rest, noise = (
+            self._takes_off,
+            self.unexplained.beyond_carried.mean,
+            self.unexplained.rest(self.material),
+        )
+        if not self.parts:
+            takes_off = f"{_UNNAMED} takes off {percent(unnamed)} of"
+            if self.unexplained.material:
+                return f"No known effect explains the gap{f', but {takes_off} it' if unnamed else ''}."
+            if not unnamed and noise == "noise":
+                return "Nothing material is missing."
+            return f"No known effect is missing; {f'{takes_off} the gap' if unnamed else f'the error is {noise}'}."
+        large = [p for p in self.parts if p.share.mean >= self.material] or [self.parts[0]]
+        small = [p.name if p.plausible else _words(p) for p in self.parts if p not in large]
+        shares = [] if told else [(p.share.mean, _words(p, f"{percent(p.share.mean)} of the gap")) for p in large]
+        if unnamed:
+            shares.append((unnamed, f"{_UNNAMED} ({percent(unnamed)} of the gap)"))
+        words = ", then ".join(said for _, said in sorted(shares, key=lambda x: -x[0]))
+        lines = [f"that is {percent(self.parts[0].share.mean)} of the gap", words] if told else [f"chiefly {words}"]
+        if rest >= 0.005 and not told and rest > max(share for share, _ in shares):
+            lines = [f"chiefly no known effect explains it ({percent(rest)} of the gap)", words]
+            rest = 0.0
+        if small:
+            lines.append(f"under {percent(self.material)}{' each' if small[1:] else ''}: {listing(small)}")
+        if rest >= 0.005:
+            lines.append(f"{percent(rest)} is reproducible and no known effect explains it")
+        text = "; ".join(filter(None, lines)) + "."
+        return text[0].upper() + text[1:]
 
     @property
     def rest(self) -> str:
         """A sentence on the error that is left, beside the named causes; empty without any, where `str()` tells it."""
         if not self.names:
             return ""
-        by_chance = " and ".join(_words(c) for c in self.chance if c.probability >= LIKELY)
-        noise = self.unexplained.rest(self.material)
+        by_chance, noise = " and ".join(map(_words, self.chance)), self.unexplained.rest(self.material)
         return f"The rest of the error is {f'in part this: {by_chance}; else {noise}' if by_chance else noise}."
-
-    def _sentence(self, lead: str) -> str:
-        """The named parts and the force without a name that the repaired simulator carries, the largest first; small
-        ones by their names alone."""
-        named = [p for p in self.parts if p.probability >= LIKELY]
-        large = [p for p in named if p.share.mean >= self.material] or named[:1]
-        small = [
-            p.name if p.plausible else f"{p.name} (physically implausible as fitted)" for p in named if p not in large
-        ]
-        shares = [(p.share.mean, _words(p, f"{percent(p.share.mean)} of the gap")) for p in large]
-        lines = []
-        if lead:
-            lines, shares = [lead], []
-        if self._takes_off and (named or self.unexplained.material):
-            shares.append((self._takes_off, f"{_UNNAMED} ({percent(self._takes_off)} of the gap)"))
-        words = [said for _, said in sorted(shares, key=lambda x: -x[0])]
-        if words:
-            lines.append(f"{'' if lead else 'chiefly '}{', then '.join(words)}")
-        if small:
-            lines.append(f"under {percent(self.material)}{' each' if small[1:] else ''}: {listing(small)}")
-        rest = self.unexplained.beyond_carried.mean
-        if rest >= 0.005 and named:
-            if not lead and rest > max(share for share, _ in shares):
-                lines[0] = lines[0].replace("chiefly ", "", 1)
-                lines.insert(0, f"chiefly no known effect explains it ({percent(rest)} of the gap)")
-            else:
-                lines.append(f"{percent(rest)} is reproducible and no known effect explains it")
-        text = "; ".join(lines) + "."
-        return text[0].upper() + text[1:]
 
     @property
     def _takes_off(self) -> float:
@@ -401,7 +390,7 @@ def budget_of(
     most = max(sum(p.share.mean for p in parts), 1.0)  # an effect without a name may cost instead of taking off
     parts = [replace(p, share=p.share.scaled(1 / most)) for p in parts]
     carried = shares.get("free form")
-    by_chance = [ChancePart(**about(n), share_of_noise=_share_of_noise(posterior, n)) for n in names if n in chance]
+    by_chance = (ChancePart(**about(n), share_of_noise=_share_of_noise(posterior, n)) for n in names if n in chance)
     return Budget(
         before=float(np.sqrt(energy[0].mean() / bottom)),
         left=float(np.sqrt(energy[-1].mean() / bottom)),
@@ -415,7 +404,7 @@ def budget_of(
             carried=None if carried is None else Quantity.of_resampled(carried[0], carried),
         ),
         repaired=repaired,
-        chance=tuple(part for part in by_chance if part.probability >= LIKELY),
+        chance=tuple(by_chance),
         material=material,
         horizon_s=held.horizon_s,
         by_drives=held.blocks.by_drives,
