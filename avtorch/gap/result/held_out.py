@@ -29,7 +29,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import multigammaln  # pyright: ignore[reportAttributeAccessIssue]
@@ -135,14 +134,13 @@ def held_out_errors(
     blocks = Blocks.of(data)
     if blocks is None:
         return None
-    chain = _nested(base, full, visited, blocks)
-    fitted = [_taught(h, blocks) for h in chain]
-    steps = [x.scores(blocks) for x in fitted]
-    ends = (fitted[-1], fitted[0])
-    found = [black_box(x.hypothesis, x.residuals, blocks) for x in ends]
-    rival, ceiling = (x.scores(blocks, beside) for x, beside in zip(ends, found, strict=True))
+    chain = [_without_chance(h) for h in _nested(base, full, visited, blocks)]
+    rows = [_taught(h, blocks) for h in chain]
+    steps = [_scores(data, blocks, x) for x in rows]
+    boxes = [black_box(chain[k], rows[k], blocks) for k in (-1, 0)]
+    rival, ceiling = (_scores(data, blocks, rows[k] + box, rows[k]) for k, (box, _) in zip((-1, 0), boxes, strict=True))
     if free is not None:
-        carried = _with_form(free, free.lagged, blocks)
+        carried = _scores(data, blocks, _with_form(free, free.lagged, blocks))
         free = free if gains(carried, steps[0], steps[-1] if named else None) else None
         steps += [] if free is None else [carried]
     return HeldOut(
@@ -151,10 +149,10 @@ def held_out_errors(
         steps=tuple(steps),
         rival=rival,
         ceiling=ceiling.no_worse_than(steps[0]),
-        possible=found[0].possible,
+        possible=boxes[0][1],
         horizon_s=min(HORIZON_S, max(rows.stop - rows.start for rows in blocks.rows) * data.dt),
         free=free is not None,
-        apart=_apart(fitted[-1].hypothesis, steps, blocks, free),
+        apart=_apart(chain[-1], steps, blocks, free),
     )
 
 
@@ -182,10 +180,10 @@ def _apart(full: Hypothesis, scored: Sequence[Scores], blocks: Blocks, free: Fit
             continue
         rest = fit(rest, 6, 0.1)
         if beside is None:
-            out[family] = _taught(rest, blocks).scores(blocks)
+            out[family] = _scores(rest.data, blocks, _taught(rest, blocks))
         else:
             rest["T_L"] = float(np.clip(beside.fit.T_L * rest["T_L"] / full["T_L"], *rest.limits("T_L")))
-            out[family] = _with_form(beside, rest, blocks)
+            out[family] = _scores(rest.data, blocks, _with_form(beside, rest, blocks))
     if free is not None and "force map" not in out:
         out["force map"] = scored[-2]
     return out
@@ -209,48 +207,15 @@ def _nested(base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis], b
 
 
 # fits -----------------------------------------------------------------------------------------------------------------
-@dataclass(frozen=True, eq=False)
-class _Taught:
-    """What fits of a hypothesis without each fold leave: `residuals` (fold, channel, frame, bin) of all frames, and
-    `errors` (channel, row) of readings, each block's by the fit without it."""
-
-    hypothesis: Hypothesis
-    residuals: FloatArray
-    errors: FloatArray
-
-    @classmethod
-    def of(cls, h: Hypothesis, rows: Sequence[FloatArray], blocks: Blocks) -> _Taught:
-        """Of readings (channel, row) by each fold's fit."""
-        data = h.data
-        residuals = np.array([data.measured - data.transform(compared(data, x)) for x in rows])
-        return cls(h, residuals, blocks.stitched([measured_readings(data) - x for x in rows]))
-
-    def scores(self, blocks: Blocks, beside: Predicted | None = None) -> Scores:
-        """Errors of free runs, and densities by the noise that the fits leave, with a black box's predictions `beside`
-        where given."""
-        data, errors, residuals = self.hypothesis.data, self.errors, self.residuals
-        if beside is not None:
-            errors, residuals = errors - blocks.stitched(beside.readings), residuals - beside.coefficients
-        fold = blocks.fold[blocks.block_of_frame]
-        nats = np.zeros(len(fold))
-        for k, frames in enumerate(blocks.taught):
-            own = fold == k
-            nats[own] = _log_density(data.only(frames), self.residuals[k][:, frames], residuals[k][:, own])
-        return Scores(
-            blocks.sums(blocks.free_runs(data, errors) ** 2),
-            np.asarray(np.bincount(blocks.block_of_frame, nats, len(blocks.rows)), np.float64),
-        )
-
-
-def _taught(h: Hypothesis, blocks: Blocks) -> _Taught:
-    h = _without_chance(h)
+def _taught(h: Hypothesis, blocks: Blocks) -> FloatArray:
+    """Readings (fold, channel, row) by the fits without each fold."""
     slopes, *_ = linearised(h, h.free)
     rows = []
     for frames in blocks.taught:
         fold, taught = h.copy(), _fold_fit(h, slopes, frames)
         fold.values, fold.force_coefficients = taught.values, taught.force_coefficients
         rows.append(readings(fold, *fold.on_grid()))
-    return _Taught.of(h, rows, blocks)
+    return np.array(rows)
 
 
 def _fold_fit(h: Hypothesis, slopes: FloatArray, frames: BoolArray) -> Hypothesis:
@@ -310,16 +275,39 @@ def _less(h: Hypothesis, effect: str) -> Hypothesis:
     return rest
 
 
-def _with_form(free: FittedForm, h: Hypothesis, blocks: Blocks) -> Scores:
-    """Of a hypothesis with the free form beside it, which each fold's other blocks teach."""
+def _with_form(free: FittedForm, h: Hypothesis, blocks: Blocks) -> FloatArray:
+    """Readings (fold, channel, row) of a hypothesis with the free form beside it, which each fold's other blocks
+    teach."""
     (accel, gained), rows = h.on_grid(), []
     for k in range(len(blocks.taught)):
         adds = free.without([own for own, fold in zip(blocks.rows, blocks.fold, strict=True) if fold == k])
         rows.append(readings(h, accel + adds, gained + speed_gained(h.data.grid, adds)))
-    return _Taught.of(h, rows, blocks).scores(blocks)
+    return np.array(rows)
 
 
 # scores --------------------------------------------------------------------------------------------------------------
+def _scores(data: DriveData, blocks: Blocks, rows: FloatArray, noise: FloatArray | None = None) -> Scores:
+    """Errors of free runs of readings `rows` (fold, channel, row) by fits without each fold, and densities by the noise
+    that these leave on the other blocks, or that the readings `noise` do."""
+    left = _residuals(data, rows)
+    taught = left if noise is None else _residuals(data, noise)
+    fold = blocks.fold[blocks.block_of_frame]
+    nats = np.zeros(len(fold))
+    for k, frames in enumerate(blocks.taught):
+        own = fold == k
+        nats[own] = _log_density(data.only(frames), taught[k][:, frames], left[k][:, own])
+    errors = blocks.stitched(measured_readings(data) - rows)
+    return Scores(
+        blocks.sums(blocks.free_runs(data, errors) ** 2),
+        np.asarray(np.bincount(blocks.block_of_frame, nats, len(blocks.rows)), np.float64),
+    )
+
+
+def _residuals(data: DriveData, rows: FloatArray) -> FloatArray:
+    """Residuals (fold, channel, frame, bin) of readings (fold, channel, row), of all frames."""
+    return np.array([data.measured - data.transform(compared(data, x)) for x in rows])
+
+
 def _run_squares(h: Hypothesis, blocks: Blocks) -> FloatArray:
     """Mean squared errors (channel,) of free runs by a fit to all blocks."""
     h = _without_chance(h)
@@ -341,36 +329,28 @@ def _log_density(taught: DriveData, residual: FloatArray, held_out: FloatArray) 
 
 
 # the black box --------------------------------------------------------------------------------------------------------
-class Predicted(NamedTuple):
-    """By the fit without each fold: `readings` (fold, channel, row), `coefficients` (fold, channel, frame, bin), and
-    `possible` (draw, channel, block): draws of the squares of free runs of what may be there."""
-
-    readings: FloatArray
-    coefficients: FloatArray
-    possible: FloatArray
-
-
-def black_box(h: Hypothesis, residuals: FloatArray, blocks: Blocks) -> Predicted:
-    """What a black box beside `h` foretells of each fold's blocks, taught by the `residuals` (fold, channel, frame,
-    bin) of the other blocks alone."""
+def black_box(h: Hypothesis, rows: FloatArray, blocks: Blocks) -> tuple[FloatArray, FloatArray]:
+    """What a black box beside `h` foretells of each fold's blocks, taught by what the readings `rows` (fold, channel,
+    row) leave on the other blocks alone: readings (fold, channel, row), and draws (draw, channel, block) of the squares
+    of free runs of what may be there."""
+    residuals = _residuals(h.data, rows)
     kind, shown = _columns(h)
     X = np.stack([h.data.transform(compared(h.data, x)) for x in shown])
     rng = np.random.default_rng(0)
     normal, uniform = rng.standard_normal((_BOX_DRAWS, len(X))), rng.random(_BOX_DRAWS)
     runs = blocks.free_runs(h.data, shown)
-    rows = []
+    foretold = []
     possible = np.zeros((_BOX_DRAWS, h.data.channel_count, len(blocks.rows)))
     for k, frames in enumerate(blocks.taught):
         taught = h.data.only(frames)
         products = band_products(taught, np.concatenate([residuals[k][None], X])[:, :, frames])
         mean, draws = _posterior(products, kind, taught.band_size, normal, uniform)
-        rows.append(np.tensordot(mean, shown, 1))
+        foretold.append(np.tensordot(mean, shown, 1))
         for b in np.flatnonzero(blocks.fold == k):
             for c in range(runs.shape[1]):
                 part = runs[:, c, blocks.rows[b]]
                 possible[:, c, b] = ((draws @ (part @ part.T)) * draws).sum(1)
-    coefficients = [h.data.transform(compared(h.data, x)) for x in rows]
-    return Predicted(np.stack(rows), np.stack(coefficients), possible)
+    return np.stack(foretold), possible
 
 
 def _posterior(
