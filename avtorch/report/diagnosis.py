@@ -293,22 +293,19 @@ def _which(found: Diagnosis) -> Picture:
 
 
 def _shrinkage(found: Diagnosis) -> Section:
-    """Errors on data held out; over several horizons as a picture."""
+    """Errors on data held out."""
     title, scores = "How far the gap shrinks", found.shrinkage
-    if scores is None or not scores.by_metric:
+    if scores is None:
         return Section(title)
     others = "the other drives" if scores.by_drives else "the other folds"
     how = (
         f"Cross-validated on {scores.blocks} blocks of the drives: each is scored by a simulator selected and fitted "
         f"on {others} alone."
     )
-    measures = measure_table(scores)
-    if len({metric.horizon_s for metric in scores.by_metric.values()}) < 2:
-        return Section(title, (how,), tables=(measures,))
     drawn = picture_of(
         "shrinkage",
         drawings.shrinkage_figure(found),
-        measures,
+        measure_table(scores),
         caption="Bold in the table: the measure that decides.",
         opened=True,
     )
