@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -10,30 +10,14 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.gap.quantity import Quantity, frame_of, plain, unit_of
 from avtorch.gap.result import sentences
-from avtorch.gap.result.attribution import Location
-from avtorch.gap.result.budget import Budget
-from avtorch.gap.result.gap_size import GapSize, Shrinkage
-from avtorch.gap.result.hypotheses import (
-    AnswerPart,
-    Candidate,
-    Scope,
-    Verdict,
-    candidate_name,
-    listed_candidates,
-    plausibility,
-)
-from avtorch.gap.result.log_facts import LogFacts
-from avtorch.gap.result.predictive_model import PredictiveModel
-from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
-from avtorch.gap.result.traces import Alarm, Traces
+from avtorch.gap.result.findings import Findings
+from avtorch.gap.result.hypotheses import plausibility
 from avtorch.gap.simulator.effect import EFFECTS
-from avtorch.gap.simulator.force_table import ForceTable, ResistanceCurve
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.inference.chains import effective_sample_size, nested_rhat, normal_scores
 from avtorch.io import Log, answer_set, atomic, write_json
@@ -59,7 +43,7 @@ DIAGNOSIS_FILES = (
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Diagnosis(Displayed):
+class Diagnosis(Displayed, Findings):
     """What the simulator lacks, according to a log; `str()` states it in a few sentences.
 
     - `candidates`: the hypotheses as `listed_candidates` orders them, whatever the order given
@@ -98,53 +82,6 @@ class Diagnosis(Displayed):
         >>> [path.name for path in found.write("out")]
         ['diagnosis.json', 'plant.toml']
     """
-
-    log: LogFacts
-    baseline: Mapping[str, Quantity]
-    gap: GapSize
-    candidates: tuple[Candidate, ...]
-    verdict: Verdict
-    onset_s: float | None = None
-    plant: GapPlant | None = None
-    draws: Mapping[str, NDArray] | None = None
-    simulator: GapPlant | None = None
-    belief: Mapping[str, NDArray] | None = None
-    assumed: Mapping[str, NDArray] | None = None
-    traces: Traces | None = None
-    remaining: tuple[Candidate, ...] | None = None
-    where: tuple[Location, ...] = ()
-    shrinkage: Shrinkage | None = None
-    contenders: tuple[PredictiveModel, ...] = ()
-    next_experiment: Mapping[str, Any] | None = None
-    setting: Mapping[str, Any] | None = None
-    complete: bool = True
-    scope: Scope | None = None
-    notes: tuple[str, ...] = ()
-    onset_log: int = 0
-    budget: Budget | None = None
-    tested: SimulatorUnderTest | None = None
-    alarms: tuple[Alarm, ...] = ()
-    parts: tuple[AnswerPart, ...] = ()
-    free_form: tuple[ForceTable | ResistanceCurve, ...] | None = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "candidates", listed_candidates(self.candidates))
-
-    @property
-    def onset_from_start_s(self) -> float | None:
-        """`onset_s` from the first row of its log [s]."""
-        return None if self.onset_s is None else self.onset_s - self.log.epochs_s[self.onset_log]
-
-    @property
-    def winner(self) -> Candidate:
-        """The verdict's entry among the hypotheses; where it is too improbable to be listed, one without numbers."""
-        name = self.verdict.name
-        return next((c for c in self.candidates if c.name == name), Candidate(name, 0.0))
-
-    def probability(self, names: str | Iterable[str]) -> float:
-        """Probability of a hypothesis, by name or names; 0 where it is not listed."""
-        name = candidate_name(names)
-        return next((c.probability for c in self.candidates if c.name == name), 0.0)
 
     def __str__(self) -> str:
         """The sentences of the terminal, one per line."""

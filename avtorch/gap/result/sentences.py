@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from avtorch.gap.result.budget import listing
+from avtorch.gap.result.findings import Findings
 from avtorch.gap.result.hypotheses import Scope
 from avtorch.gap.simulator.effect import named_cause
 from avtorch.io.clock import clock_words
-
-if TYPE_CHECKING:
-    from avtorch.gap.result.diagnosis import Diagnosis
 
 SURE = 0.9
 """Probability from which a headline is unqualified."""
@@ -19,12 +15,12 @@ _ALIASES = 4  # hypotheses named beside the verdict
 _UNTRIED = 6  # names of effects listed as not tried
 
 
-def headline(found: Diagnosis) -> str:
+def headline(found: Findings) -> str:
     """The verdict as one sentence; provisional where the budget ended the search."""
     return _verdict(found) if found.complete else f"Provisional: {_verdict(found)}"
 
 
-def _verdict(found: Diagnosis) -> str:
+def _verdict(found: Findings) -> str:
     verdict, p = found.verdict, _share(found.winner.probability)
     if verdict.abstained and found.winner.probability < 0.5:
         return f"No cause can be named: perhaps it is not among the {_known(found)} ({p}), perhaps too weak to tell."
@@ -49,7 +45,7 @@ def _verdict(found: Diagnosis) -> str:
     return _lacks(found, p)
 
 
-def _lacks(found: Diagnosis, p: str) -> str:
+def _lacks(found: Findings, p: str) -> str:
     """That the simulator lacks the verdict's effects, `p` as words."""
     verdict, winner = found.verdict, found.winner
     who = "The" if winner.probability >= SURE else "Probably the" if winner.probability >= 0.5 else "Perhaps the"
@@ -59,7 +55,7 @@ def _lacks(found: Diagnosis, p: str) -> str:
     return f"{who} simulator lacks this ({p}): {', and '.join(_cause(found, name) for name in verdict.names)}."
 
 
-def _cause(found: Diagnosis, name: str) -> str:
+def _cause(found: Findings, name: str) -> str:
     """One of the verdict's effects in words, at the parameters of the budget or else of the fit."""
     parts = [] if found.budget is None else [*found.budget.parts, *found.budget.chance]
     of_budget = next((part.parameters for part in parts if part.name == name), None)
@@ -71,7 +67,7 @@ def _cause(found: Diagnosis, name: str) -> str:
     return named_cause(name, {key: q.mean for key, q in (of_budget or fitted).items()})
 
 
-def tested(found: Diagnosis) -> list[str]:
+def tested(found: Findings) -> list[str]:
     """What is said of a simulator that is not avtorch's own, beyond the headline."""
     facts = found.tested
     if facts is None:
@@ -98,7 +94,7 @@ def tested(found: Diagnosis) -> list[str]:
     return lines
 
 
-def budget(found: Diagnosis) -> list[str]:
+def budget(found: Findings) -> list[str]:
     """The sentence on the budget of the gap, and what it divides."""
     if found.budget is None:
         return []
@@ -126,14 +122,14 @@ def budget(found: Diagnosis) -> list[str]:
     ]
 
 
-def onset(found: Diagnosis) -> list[str]:
+def onset(found: Findings) -> list[str]:
     """The sentence on the onset."""
     if found.onset_s is not None:
         return [f"The gap begins at {moment(found)}."]
     return ["The gap is there from the start."] if found.winner.effects else []
 
 
-def moment(found: Diagnosis) -> str:
+def moment(found: Findings) -> str:
     """The onset from the log's start, and in brackets on the log's own clock; one figure where both are the same."""
     assert found.onset_s is not None
     assert found.onset_from_start_s is not None
@@ -143,7 +139,7 @@ def moment(found: Diagnosis) -> str:
     return f"{found.onset_from_start_s:.1f} s from {of} start ({clock_words(round(found.onset_s, 1))})"
 
 
-def where(found: Diagnosis) -> list[str]:
+def where(found: Findings) -> list[str]:
     """Where the gap lies, apart from an onset."""
     places = []
     for part in found.where:
@@ -153,7 +149,7 @@ def where(found: Diagnosis) -> list[str]:
     return [f"The gap lies {', '.join(places)}."] if places else []
 
 
-def shrinkage(found: Diagnosis) -> list[str]:
+def shrinkage(found: Findings) -> list[str]:
     """How far a repaired simulator in which nothing has a name shrinks the gap on held-out data; where something has
     one, the budget's sentence says it."""
     scores = found.shrinkage
@@ -172,7 +168,7 @@ def shrinkage(found: Diagnosis) -> list[str]:
     return [f"On held-out {parts}{line} of the repaired simulator; {end}."]
 
 
-def moved(found: Diagnosis) -> list[str]:
+def moved(found: Findings) -> list[str]:
     """The change of the baseline's fit by the effect."""
     changes = [
         f"{name} {found.baseline[name].mean:.2f} → {q.mean:.2f}{' s' if name == 'T_L' else ''}"
@@ -182,7 +178,7 @@ def moved(found: Diagnosis) -> list[str]:
     return [f"Baseline fitted without and with the {effects}: {', '.join(changes)}."] if changes else []
 
 
-def aliases(found: Diagnosis) -> str:
+def aliases(found: Findings) -> str:
     """The hypotheses that the log cannot distinguish from the verdict."""
     tried = found.scope is None or not found.scope.not_scored
     words = {"none": "no effect at all", "unknown": f"a cause {'outside the table' if tried else 'that was not tried'}"}
@@ -213,11 +209,11 @@ def untried(scope: Scope) -> list[str]:
     return [f"Not tried: {listing(parts)}. Probabilities cover only what was tried; unknown stands for the rest."]
 
 
-def _all_tried(found: Diagnosis) -> bool:
+def _all_tried(found: Findings) -> bool:
     return found.complete and (found.scope is None or found.scope.whole)
 
 
-def _known(found: Diagnosis) -> str:
+def _known(found: Findings) -> str:
     """The set of effects that the sentence excludes."""
     if found.scope is None or _all_tried(found):
         return "effects known here"
@@ -225,14 +221,12 @@ def _known(found: Diagnosis) -> str:
     return f"single {tried}" if found.scope.pairs == "none" else tried
 
 
-def gap(found: Diagnosis) -> list[str]:
+def gap(found: Findings) -> list[str]:
     """The rollout errors of the baseline simulator."""
     gap = found.gap
     parts = []
     if gap.rollout_rmse_accel is not None:
         floor = "" if gap.rollout_floor_accel is None else f" ({gap.rollout_floor_accel:.2g} with the best hypothesis)"
-        if gap.rollout_floor_accel is not None and gap.rollout_floor_accel > 0.97 * gap.rollout_rmse_accel:
-            floor = " (no smaller with the best hypothesis)"
         parts.append(f"acceleration error {gap.rollout_rmse_accel:.2g} m/s²{floor}")
     if gap.rollout_rmse_speed is not None:
         parts.append(f"speed error {gap.rollout_rmse_speed:.2g} m/s")
@@ -252,7 +246,7 @@ def number(p: float) -> str:
     return "<.001" if 0 < p < 0.0005 else ">.999" if 0.9995 <= p < 1 else f"{p:.3f}"
 
 
-def remains(found: Diagnosis) -> list[str]:
+def remains(found: Findings) -> list[str]:
     """Hypotheses for what the simulator lacks besides the delay."""
     if not found.remaining:
         return []
@@ -261,7 +255,7 @@ def remains(found: Diagnosis) -> list[str]:
     return [f"Hypotheses once the simulator has dead_time: {each}."]
 
 
-def to_set(found: Diagnosis) -> list[str]:
+def to_set(found: Findings) -> list[str]:
     """The recommended setting."""
     if found.setting is None:
         return []
@@ -269,7 +263,7 @@ def to_set(found: Diagnosis) -> list[str]:
     return [why if why.startswith("Nothing to set") else f"To set: {why}"]
 
 
-def to_drive(found: Diagnosis) -> list[str]:
+def to_drive(found: Findings) -> list[str]:
     """The recommended next experiment."""
     experiment = found.next_experiment
     if experiment is None:
