@@ -275,10 +275,14 @@ class Fit:
     def __init__(self, car: Car, x: FloatArray, *, cut: bool = False) -> None:
         self.car, self.x = car, x
         self.runs = car.runs_in_blocks if cut else car.runs
-        self.errors, slopes = self._driven(x)
-        aside = x.copy()
+        self.errors, self._slopes = self._driven(x)
+
+    @cached_property
+    def slopes(self) -> FloatArray:
+        """By the coefficients, that of the lag by a finite difference."""
+        aside = self.x.copy()
         aside[-1] += _LAG_STEP
-        self.slopes = np.column_stack([slopes, (self._driven(aside)[0] - self.errors) / _LAG_STEP])
+        return np.column_stack([self._slopes, (self._driven(aside)[0] - self.errors) / _LAG_STEP])
 
     @property
     def mse(self) -> float:
