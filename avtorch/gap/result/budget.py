@@ -53,7 +53,6 @@ unexplained of the gap."""
 
 UNNAMED = "a force without a name"
 """What the repaired simulator carries beside the named effects, in a table."""
-_UNNAMED = "a force of command and speed without a name"
 _NOTHING = 1e-3  # of the energy before, below which free runs show no gap
 _SIZES = 48  # draws of the size of a family
 
@@ -263,23 +262,17 @@ class Budget:
     def said(self, *, told: bool = False) -> str:
         """The parts and the force without a name that the repaired simulator carries, the largest first, small ones by
         their names alone; `told`: the sentence before has told the one part that there is."""
-        unnamed, rest, noise = (
-            self._takes_off,
-            self.unexplained.beyond_carried.mean,
-            self.unexplained.rest(self.material),
-        )
+        if not self.parts and self.unexplained.material:
+            return "No known effect explains the gap."
         if not self.parts:
-            takes_off = f"{_UNNAMED} takes off {percent(unnamed)} of"
-            if self.unexplained.material:
-                return f"No known effect explains the gap{f', but {takes_off} it' if unnamed else ''}."
-            if not unnamed and noise == "noise":
-                return "Nothing material is missing."
-            return f"No known effect is missing; {f'{takes_off} the gap' if unnamed else f'the error is {noise}'}."
+            return f"No known effect is missing; the error is {self.unexplained.rest(self.material)}."
+        carried, rest = self.unexplained.carried, self.unexplained.beyond_carried.mean
         large = [p for p in self.parts if p.share.mean >= self.material] or [self.parts[0]]
         small = [p.name if p.plausible else _words(p) for p in self.parts if p not in large]
         shares = [] if told else [(p.share.mean, _words(p, f"{percent(p.share.mean)} of the gap")) for p in large]
-        if unnamed:
-            shares.append((unnamed, f"{_UNNAMED} ({percent(unnamed)} of the gap)"))
+        if carried is not None and carried.mean >= 0.005:
+            what = f"a force of command and speed without a name ({percent(carried.mean)} of the gap)"
+            shares.append((carried.mean, what))
         words = ", then ".join(said for _, said in sorted(shares, key=lambda x: -x[0]))
         lines = [f"that is {percent(self.parts[0].share.mean)} of the gap", words] if told else [f"chiefly {words}"]
         if rest >= 0.005 and not told and rest > max(share for share, _ in shares):
@@ -299,12 +292,6 @@ class Budget:
             return ""
         by_chance, noise = " and ".join(map(_words, self.chance)), self.unexplained.rest(self.material)
         return f"The rest of the error is {f'in part this: {by_chance}; else {noise}' if by_chance else noise}."
-
-    @property
-    def _takes_off(self) -> float:
-        """What of the gap the repaired simulator takes off without a name; 0 where that is next to nothing."""
-        carried = self.unexplained.carried
-        return 0.0 if carried is None or carried.mean < 0.005 else carried.mean
 
     def to_dict(self) -> dict[str, Any]:
         """The object `budget` of `diagnosis.json`."""
