@@ -213,7 +213,8 @@ def _drive(  # pragma: no cover - compiled
                 for k, share in ((near, more), (near - 1, 1.0 - more)):
                     if k >= 0:
                         u -= share * off[k]
-                        du -= share * by_off[k]
+                        for j in range(size):
+                            du[j] -= share * by_off[k, j]
             a, p, by_u = _below(u, knots_u)
             b, q, by = _below(v, knots_v)
             n = a * nv + b
@@ -234,8 +235,9 @@ def _drive(  # pragma: no cover - compiled
             if late >= 0.0:
                 left = (1 - q) * table[a, b] + q * table[a, b + 1]
                 steep = by_u * ((1 - q) * table[a + 1, b] + q * table[a + 1, b + 1] - left)
-                dv += new * steep * du
-                dx += (1 - keep) * steep * du
+                for j in range(size):
+                    dv[j] += new * steep * du[j]
+                    dx[j] += (1 - keep) * steep * du[j]
             for j, w in ((n, (1 - p) * (1 - q)), (n + 1, (1 - p) * q), (n + nv, p * (1 - q)), (n + nv + 1, p * q)):
                 dv[j] += new * w
                 dx[j] += (1 - keep) * w
