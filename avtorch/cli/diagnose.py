@@ -280,12 +280,12 @@ def _follow(talk: Talk, given: Mapping[str, Any], effects: Sequence[str] | None)
 
 
 def _loop_table(parameters: Mapping[str, Any]) -> Table:
-    from avtorch.gap.quantity import unit_of, words_of
+    from avtorch.gap.quantity import unit_behind, words_of
     from avtorch.report.table import Table
 
-    units = {name: "" if unit_of(name) == "-" else f" {unit_of(name)}" for name in parameters}
     rows = tuple(
-        (words_of(name), f"{q.mean:.2f}{units[name]}", f"{q.q05:.2f} to {q.q95:.2f}") for name, q in parameters.items()
+        (words_of(name), f"{q.mean:.2f}{unit_behind(name)}", f"{q.q05:.2f} to {q.q95:.2f}")
+        for name, q in parameters.items()
     )
     return Table("The loop", ("of the loop", "mean", "90 %"), rows)
 

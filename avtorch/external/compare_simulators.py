@@ -38,7 +38,7 @@ from avtorch.external.external_simulator import ExternalSimulator, Progress
 from avtorch.external.simulator import DrivenPlant
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.compare import LEVEL, check_length, whole_runs
-from avtorch.gap.quantity import Quantity, of_fields, unit_of, words_of
+from avtorch.gap.quantity import Quantity, of_fields, unit_behind, words_of
 from avtorch.gap.result.counted_rows import CountedRows
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.simulator.effect import Effect
@@ -175,9 +175,8 @@ class SimulatorComparison(Displayed):
 def _told_values(values: Mapping[str, float]) -> str:
     told = []
     for key, value in values.items():
-        unit = unit_of(key)
         words = "" if key in ("T_L", "K_L") else f"{words_of(key)} "
-        told.append(f"{words}{value:.3g}{'' if unit == '-' else f' {unit}'}")
+        told.append(f"{words}{value:.3g}{unit_behind(key)}")
     return ", ".join(told)
 
 

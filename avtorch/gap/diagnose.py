@@ -158,9 +158,8 @@ def diagnose(
     found = None if named_only else fitted_form(repaired.examined.hypothesis, base, none)
     free = found if found is not None and found.earns_its_place(named=named) else None
     visited = [h for h in inference.search.visited.values() if h.force is None]
-    held = held_out_errors(none, repaired.examined.hypothesis, visited, free)
-    if held is not None and free is not None and not held.free_gains(named=named):
-        free, held = None, held.without_free()
+    held = held_out_errors(none, repaired.examined.hypothesis, visited, free, named=named)
+    free = free if held is None or held.free else None
     lag_and_gain, assumed = base_quantities(none, seed)
     alone = next(x for x in average.examined if x.hypothesis is none)
     simulator = plant([], baseline=plant_of(none, base), sigma=alone.compositions[0].slow.process_noise)
@@ -168,7 +167,7 @@ def diagnose(
     belief, moved = handed_back.belief() if named else assumed, handed_back.moved()
     if free is not None:
         car = simulator if back is None else back
-        back = free.form.beside(car)
+        back = free.beside(car)
         ratio = {"T_L": float(back.T_L) / float(car.T_L), "K_L": float(back.K_L) / float(car.K_L)}
         belief = {key: x * ratio.get(key, 1.0) for key, x in belief.items()}
         moved = {key: q.scaled(ratio[key]) for key, q in moved.items()}
@@ -195,7 +194,7 @@ def diagnose(
         budget = replace(budget, families=families, unexplained=rest if rest.material else budget.unexplained)
     if free is not None:
         whose = "Beside its names the" if named else "The"
-        carries = f"{whose} repaired simulator carries {free.form.words}, without a name"
+        carries = f"{whose} repaired simulator carries {free.words}, without a name"
         notes[f"{carries}: on blocks left out it foretells more."] = None
     if told is not None:
         told("held-out blocks", 1, 1)
@@ -246,7 +245,7 @@ def diagnose(
         notes=(*notes, *([hidden] if hidden else []), *sentences.untried(scope)),
         budget=budget,
         parts=parts,
-        free_form=None if free is None else free.form,
+        free_form=None if free is None else free.effects(),
     )
     return answer if beside is None else beside.told(answer)
 

@@ -119,6 +119,12 @@ def unit_of(key: str) -> str:
     return next((unit for end, unit in _UNITS.items() if key.endswith(end)), "-")
 
 
+def unit_behind(key: str) -> str:
+    """The same behind a number: `" s"`; empty for none."""
+    unit = unit_of(key)
+    return "" if unit == "-" else f" {unit}"
+
+
 def words_of(key: str) -> str:
     """A parameter's key as words, its unit left out: `"half_width_mps2"` is "half width"."""
     if key in ("T_L", "K_L"):

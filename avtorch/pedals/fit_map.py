@@ -36,7 +36,6 @@ from avtorch.gap.result.free_form import (
     knots_of,
     squares_of,
 )
-from avtorch.gap.result.free_form import drive as drive_runs
 from avtorch.gap.result.output_error import Coefficients, Rows
 from avtorch.io import LogSource
 from avtorch.pedals.pedal_drive import PedalDrive
@@ -154,8 +153,7 @@ def _map_of(drive: PedalDrive, fit: Fit, dead_time: float) -> PedalMap:
     More of a pedal never slows the car: where the force turns back, the map is halfway between the least monotone one
     above it and the greatest below.
     """
-    rows = fit.car.rows
-    at = Coefficients.of(fit.x[:-1], rows.shape)
+    rows, at = fit.car.rows, fit.at
     spans = {name: (float(x.min()), float(x.max())) for name, x in drive.pedals.items()}
     names = [name for name in spans if name != RATE]
     ends = [SIGN[name] * drive.factors[name] * x for name in names for x in spans[name]]
@@ -177,7 +175,7 @@ def _map_of(drive: PedalDrive, fit: Fit, dead_time: float) -> PedalMap:
         knots = np.unique([min(spans[RATE][0], 0.0), 0.0, max(spans[RATE][1], 0.0)])
         pedals[RATE] = PedalTable(knots, np.outer(max(at.gain, 0.0) * knots, np.ones(len(rows.knots_v))))
     driven = (float(drive.speed.min()), float(drive.speed.max()))
-    return PedalMap(rows.knots_v, force[zero], pedals, float(np.exp(fit.x[-1])), dead_time, driven=driven)
+    return PedalMap(rows.knots_v, force[zero], pedals, fit.T_L, dead_time, driven=driven)
 
 
 def _with_errors(made: PedalMap, drive: PedalDrive, fit: Fit, changes: FloatArray) -> PedalMap:
@@ -247,7 +245,7 @@ def _whitening(drive: PedalDrive) -> tuple[float, float]:
     for _ in range(_KEPT_ROUNDS):
         car = car_of(drive, _DEAD_TIMES_S[1], knots, SLOPE_SD, kept)
         fit = fitted(car, _FIRST, car.zero if fit is None else fit.x, len(car.runs.of_run))
-        left, of_run = drive_runs(replace(car, kept=0.0), fit.x)[0], fit.runs.of_run
+        left, of_run = Fit(replace(car, kept=0.0), fit.x).errors, fit.runs.of_run
         now, then = (left[k][of_run[1:] == of_run[:-1]] for k in (slice(1, None), slice(-1)))
         kept = float(np.clip((now * then).sum() / max(float((then**2).sum()), 1e-12), 0.0, 0.99))
     return kept, float(len(of_run))
@@ -262,8 +260,7 @@ def _with_dead_time(drive: PedalDrive, sizes: Sizes, independent: float, kept: f
         car = car_of(drive, dead_time, knots, 0.0 if sizes == FACTOR else SLOPE_SD, kept)
         near = min(known, key=lambda other: abs(other - dead_time), default=None)
         fit = fitted(car, sizes, car.zero if near is None else known[near][1].x, independent)
-        mse = max(float((fit.errors**2).mean()), 1e-8)
-        known[dead_time] = independent * np.log(mse) + Prior(car, sizes).of(fit.x), fit
+        known[dead_time] = independent * np.log(fit.mse) + Prior(car, sizes).of(fit.x), fit
         return known[dead_time][0]
 
     k = int(np.argmin([cost(dead_time) for dead_time in _DEAD_TIMES_S]))
@@ -277,7 +274,7 @@ def _changes(drive: PedalDrive, fit: Fit, prior: Prior, dead_time: float, indepe
     """Changes (draw, coefficient) whose squares sum to variances, the dead time's last."""
     rows = fit.car.rows
     aside = car_of(drive, dead_time + _DEAD_TIME_STEP_S, (rows.knots_u, rows.knots_v), fit.car.slope, fit.car.kept)
-    by_dead_time = (drive_runs(aside, fit.x)[0] - fit.errors) / _DEAD_TIME_STEP_S
+    by_dead_time = (Fit(aside, fit.x).errors - fit.errors) / _DEAD_TIME_STEP_S
     J = np.column_stack([fit.slopes[:, prior.moves], by_dead_time])
     H = independent / max(float((fit.errors**2).sum()), 1e-12) * J.T @ J
     H[:-1, :-1] += prior.precision
@@ -303,7 +300,7 @@ def _scored(of: Mapping[str, tuple[Fit, Sizes]], left: LeftOut, independent: flo
         squares = np.full(len(block), np.nan)
         for is_told, step in zip(left.told[left.way == 0], steps[left.way == 0], strict=True):
             told = np.isin(block, own[is_told])
-            mean = np.bincount(runs.of_run, drive_runs(car, fit.x + step, cut=True)[0] ** 2, len(told))
+            mean = np.bincount(runs.of_run, Fit(car, fit.x + step, cut=True).errors ** 2, len(told))
             squares[told] = mean[told] / np.bincount(runs.of_run, minlength=len(told))[told]
         runs_told = np.isfinite(squares)
         block, squares = block[runs_told], squares[runs_told]

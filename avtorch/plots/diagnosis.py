@@ -9,15 +9,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator, PercentFormatter
 
-from avtorch.arrays import BoolArray, FloatArray, IntArray
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.attribution import UNITS, Axis
-from avtorch.gap.result.budget import LIKELY, Budget, percent
+from avtorch.gap.result.budget import UNNAMED, Budget, percent
 from avtorch.gap.result.counted_rows import HORIZON_S
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.hypotheses import Candidate
 from avtorch.gap.result.traces import Traces
+from avtorch.gap.simulator.force_table import ForceTable, ResistanceCurve
 from avtorch.io.clock import time_label
 from avtorch.plots.style import (
     BLACK,
@@ -43,9 +44,11 @@ def budget_bars(ax: Axes, budget: Budget) -> Axes:
 
     Without any part all of the gap is unexplained, so the bars divide the error: what is unexplained, and noise.
     """
-    rows = _bars_of(budget)
+    rest = ORANGE if budget.parts or budget.unexplained.material else SKY
+    colours = {"noise": GREY, "unexplained": rest, UNNAMED: SKY}
     begun, reach = 0.0, 1.0
-    for i, (_, share, colour) in enumerate(rows):
+    for i, (name, share) in enumerate(budget.shares.items()):
+        colour = colours.get(name, BLUE)
         ax.barh(i, share.mean, left=begun, color=colour, height=0.64)
         ax.plot([begun + share.q05, begun + share.q95], [i, i], color=BLACK, lw=1.0)
         ax.text(max(begun + share.q95, begun + share.mean) + 0.012, i, percent(share.mean), va="center", fontsize=9)
@@ -53,27 +56,16 @@ def budget_bars(ax: Axes, budget: Budget) -> Axes:
             ax.plot([begun, begun], [i - 1, i], color=GREY, lw=0.6)
         reach = max(reach, begun + share.q95)  # a whisker may end beyond the whole
         begun += share.mean
-    ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+    ax.set_yticks(range(len(budget.shares)), list(budget.shares))
     ax.set(
         xlabel=f"share of the {'gap' if budget.parts else 'error'} in held-out {budget.horizon_s:.3g} s rollouts",
         xlim=(0, reach * 1.12),
-        ylim=(len(rows) - 0.4, -0.6),
+        ylim=(len(budget.shares) - 0.4, -0.6),
     )
     ax.set_xticks(_UP_TO_ONE)
     ax.xaxis.set_major_formatter(PercentFormatter(1.0, 0, " %"))
     ax.grid(axis="y", visible=False)
     return ax
-
-
-def _bars_of(budget: Budget) -> list[tuple[str, Quantity, str]]:
-    """Names, shares and colours."""
-    if budget.parts:
-        named = [(p.name, p.share, BLUE if p.probability >= LIKELY else SKY) for p in budget.parts]
-        rest = budget.unexplained
-        carried = [] if rest.carried is None else [("a force without a name", rest.carried, SKY)]
-        return [*named, *carried, ("unexplained", rest.beyond_carried, ORANGE)]
-    rest, noise = budget.error
-    return [("unexplained", rest, ORANGE if budget.unexplained.material else SKY), ("noise", noise, GREY)]
 
 
 _UP_TO_ONE = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -86,18 +78,16 @@ def traces_of(found: Diagnosis) -> Traces:
     return found.traces
 
 
-def _liveliest(time: FloatArray, stretch: IntArray, size: FloatArray, seconds: float) -> slice:
+def _liveliest(traces: Traces, size: FloatArray, seconds: float) -> slice:
     """The window within one stretch in which `size` (row,) is largest."""
-    best, worth = slice(0, len(time)), -1.0
-    for number in np.unique(stretch):
-        rows = np.flatnonzero(stretch == number)
-        step = float(np.median(np.diff(time[rows]))) if len(rows) > 1 else 1.0
-        width = min(len(rows), max(2, round(seconds / step)))
+    best, worth = slice(0, len(size)), -1.0
+    for rows in traces.stretches:
+        width = min(len(rows), max(2, round(seconds / traces.step)))
         total = np.concatenate([[0.0], np.cumsum(size[rows])])
-        sums = total[width:] - total[:-width]
+        sums = (total[width:] - total[:-width]) / width
         first = int(sums.argmax())
-        if float(sums[first]) / width > worth:
-            best, worth = slice(int(rows[first]), int(rows[first]) + width), float(sums[first]) / width
+        if sums[first] > worth:
+            best, worth = slice(int(rows[first]), int(rows[first]) + width), float(sums[first])
     return best
 
 
@@ -112,7 +102,7 @@ def budget_figure(found: Diagnosis) -> Figure:
     """The budget of the gap. Raises `InputError` where the diagnosis has none."""
     if found.budget is None:
         raise InputError("budget: the diagnosis has none to draw; its drives are too short to hold out blocks")
-    figure, (ax,) = panels_of(1, 0.9 + 0.36 * len(_bars_of(found.budget)))
+    figure, (ax,) = panels_of(1, 0.9 + 0.36 * len(found.budget.shares))
     budget_bars(ax, found.budget)
     return figure
 
@@ -131,7 +121,7 @@ def road_figure(found: Diagnosis) -> Figure:
     of_speed = traces.channels[k] == "speed"
     # beyond the horizon a simulated speed may be anywhere
     seconds = min(_SECONDS, HORIZON_S) if of_speed else _SECONDS
-    inside = _liveliest(traces.time, traces.stretch, np.abs(traces.before[k] - traces.after[k]), seconds)
+    inside = _liveliest(traces, np.abs(traces.before[k] - traces.after[k]), seconds)
     measured, before, after = (x[k][inside] for x in (traces.measured, traces.before, traces.after))
     if of_speed:  # a rollout begun at the measured speed
         before, after = (x + measured[0] - x[0] for x in (before, after))
@@ -221,51 +211,35 @@ def shrinkage_figure(found: Diagnosis) -> Figure:
     return figure
 
 
-def _force_contours(ax: Axes, found: Diagnosis) -> None:
+def _force_contours(ax: Axes, traces: Traces | None, table: ForceTable) -> None:
     """Force beyond K u [m/s²] of the force map over speed and command; hatched, what was not driven: there only its
     smoothness speaks, and far from the drive it goes back to K u."""
-    form = found.free_form
-    assert form is not None
-    u, v, table = form.knots_u, form.knots_v, form.at.table
-    most = max(float(np.abs(table).max()), 1e-6)
-    drawn = ax.contourf(v, u, table, levels=np.linspace(-most, most, 13), cmap="RdBu_r")
+    u, v, force = (np.array(x) for x in (table.command_mps2, table.speed_mps, table.force_mps2))
+    most = max(float(np.abs(force).max()), 1e-6)
+    drawn = ax.contourf(v, u, force, levels=np.linspace(-most, most, 13), cmap="RdBu_r")
     ax.figure.colorbar(drawn, ax=ax, label="force beyond K u [m/s²]", format="%.2g")
-    across, along, driven = _driven_cells(found)
-    # contourf takes values in the middle of cells
-    middle = [0.5 * (x[1:] + x[:-1]) for x in (across, along)]
-    ax.contourf(*middle, (~driven).T.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
+    ends = v[[0, -1]], u[[0, -1]]
+    if traces is not None and traces.speed is not None:
+        ends = np.clip([traces.speed.min(), traces.speed.max()], *ends[0]), ends[1]
+        edges = [np.linspace(low, high, _CELLS + 1) for low, high in ends]
+        driven = np.histogram2d(traces.speed, traces.command, bins=edges)[0] > 0
+        # contourf takes values in the middle of cells
+        middle = [0.5 * (x[1:] + x[:-1]) for x in edges]
+        ax.contourf(*middle, (~driven).T.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
     ax.axhline(0.0, color=GREY, lw=0.8)
-    ax.set(xlabel="speed [m/s]", ylabel="command [m/s²]", xlim=across[[0, -1]], ylim=along[[0, -1]])
+    ax.set(xlabel="speed [m/s]", ylabel="command [m/s²]", xlim=ends[0], ylim=ends[1])
     ax.grid(visible=False)
 
 
-def _resistance_line(ax: Axes, found: Diagnosis) -> None:
+def _resistance_line(ax: Axes, traces: Traces | None, curve: ResistanceCurve) -> None:
     """The resistance of the free form [m/s²] over speed, and where the middle nine tenths of the drive lie; where
     nothing was driven it is a line."""
-    form = found.free_form
-    assert form is not None
-    ax.plot(form.knots_v, form.at.curve, color=BLUE, marker=".")
-    speed = None if found.traces is None else found.traces.speed
-    if speed is not None:
-        low, high = np.quantile(speed, (0.05, 0.95))
+    ax.plot(curve.speed_mps, curve.force_mps2, color=BLUE, marker=".")
+    if traces is not None and traces.speed is not None:
+        low, high = np.quantile(traces.speed, (0.05, 0.95))
         ax.axvspan(float(low), float(high), color=GREY, alpha=0.15, lw=0)
     ax.axhline(0.0, color=BLACK, lw=0.8)
     ax.set(xlabel="speed [m/s]", ylabel="acceleration [m/s²]")
-
-
-def _driven_cells(found: Diagnosis) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Edges of cells in speed [m/s] and command [m/s²], and whether the drive was in each (speed, command)."""
-    form, traces = found.free_form, found.traces
-    assert form is not None
-    ends = [form.knots_v[[0, -1]], form.knots_u[[0, -1]]]
-    speed = None if traces is None else traces.speed
-    if speed is not None:
-        ends[0] = np.clip([speed.min(), speed.max()], *ends[0])
-    edges = [np.linspace(low, high, _CELLS + 1) for low, high in ends]
-    if traces is None or speed is None:
-        return edges[0], edges[1], np.ones((_CELLS, _CELLS), bool)
-    counts = np.histogram2d(speed, traces.command, bins=edges)[0]
-    return edges[0], edges[1], counts > 0
 
 
 @styled
@@ -274,17 +248,14 @@ def free_form_figure(found: Diagnosis) -> Figure:
 
     Raises `InputError` where it carries nothing.
     """
-    form = found.free_form
-    if form is None or not form.sizes.any:
+    if not found.free_form:
         raise InputError("free_form: the repaired simulator carries nothing without a name")
-    panels = [
-        draw
-        for draw, size in ((_force_contours, form.sizes.table), (_resistance_line, form.sizes.resistance))
-        if size > 0
-    ]
-    figure, axes = panels_of(len(panels), 3.3, wide=4.3 * len(panels))
-    for ax, draw in zip(axes, panels, strict=True):
-        draw(ax, found)
+    figure, axes = panels_of(len(found.free_form), 3.3, wide=4.3 * len(found.free_form))
+    for ax, part in zip(axes, found.free_form, strict=True):
+        if isinstance(part, ForceTable):
+            _force_contours(ax, found.traces, part)
+        else:
+            _resistance_line(ax, found.traces, part)
     return figure
 
 

@@ -19,7 +19,7 @@ from avtorch.errors import InputError
 from avtorch.experiment import Experiment
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.manoeuvres import Manoeuvre
-from avtorch.gap.result.residuals import Residuals
+from avtorch.gap.result.residuals import binned_means, correlation, residuals, spectrum, usual
 from avtorch.gap.result.traces import Alarm, Reason, Traces, Uncounted
 from avtorch.plots.diagnosis import budget_bars, traces_of
 from avtorch.plots.style import (
@@ -79,10 +79,7 @@ class DriveTime:
 def drive_time(found: Diagnosis) -> DriveTime:
     """The axis of the whole drive. Raises `InputError` where there are no traces."""
     traces = traces_of(found)
-    time, new = traces.time, np.flatnonzero(np.diff(traces.time) < 0) + 1
-    number = np.zeros(len(time), int)
-    number[new] = 1
-    number = np.cumsum(number)
+    time, number = traces.time, traces.log
     apart = _LOGS_APART * float(sum(time[number == n].max() for n in np.unique(number)))
     begins = [0.0]
     for n in range(int(number[-1])):
@@ -225,37 +222,36 @@ def manoeuvre_figure(manoeuvre: Manoeuvre, traces: Traces) -> Figure:
 
 
 # what is left ------------------------------------------------------------------------------------------------------
-def residuals_of(found: Diagnosis) -> Residuals:
-    """The residuals of a diagnosis. Raises `InputError` where it has no traces."""
-    return Residuals.of(traces_of(found))
+def residuals_of(found: Diagnosis) -> dict[str, FloatArray]:
+    """The residuals (row,) by label: without, and where something was named also with it.
+
+    Raises `InputError` where there are no traces.
+    """
+    before, after = residuals(traces_of(found))
+    both = {"baseline simulator": before, "with what was named": after}
+    return both if found.winner.effects else {"baseline simulator": before}
 
 
-def sides(found: Diagnosis, left: Residuals) -> Mapping[str, FloatArray]:
-    """The residuals (row,) by label: without, and where something was named also with it."""
-    both = {"baseline simulator": left.before, "with what was named": left.after}
-    return both if found.winner.effects else {"baseline simulator": left.before}
-
-
-def _against(ax: Axes, found: Diagnosis, left: Residuals, axis: Literal["command", "speed"]) -> None:
+def _against(ax: Axes, traces: Traces, both: Mapping[str, FloatArray], axis: Literal["command", "speed"]) -> None:
     """Means of the residual in bins of the command or the speed, with central 90 % intervals by blocks of the drive."""
-    along = left.command if axis == "command" else left.speed
+    along = traces.command if axis == "command" else traces.speed
     assert along is not None, "a speed that was measured"
-    for label, residual in sides(found, left).items():
-        bins = left.against(along, residual)
+    for label, residual in both.items():
+        bins = binned_means(traces, along, residual)
         ax.fill_between(bins.place, bins.low, bins.high, color=_COLOURS[label], alpha=0.2, lw=0)
         ax.plot(bins.place, bins.mean, "o-", color=_COLOURS[label], lw=1.2, ms=3, label=label)
     ax.axhline(0.0, color=BLACK, lw=0.8)
     ax.set(xlabel=f"{axis} [{'m/s²' if axis == 'command' else 'm/s'}]", ylabel="mean residual [m/s²]")
 
 
-def _spectrum(ax: Axes, found: Diagnosis, left: Residuals) -> None:
+def _spectrum(ax: Axes, traces: Traces, both: Mapping[str, FloatArray]) -> None:
     """Power of the residual over frequency, with its central 90 %."""
-    for label, residual in sides(found, left).items():
-        spectrum = left.spectrum(residual)
-        if spectrum is not None:
+    for label, residual in both.items():
+        found = spectrum(traces, residual)
+        if found is not None:
             # an interval of frequencies a point: a picture has no room for hundreds
-            few = np.unique(np.geomspace(1, len(spectrum.frequency), 60).astype(int)) - 1
-            f, power, low, high = (x[few] for x in (spectrum.frequency, spectrum.power, spectrum.low, spectrum.high))
+            few = np.unique(np.geomspace(1, len(found.frequency), 60).astype(int)) - 1
+            f, power, low, high = (x[few] for x in found)
             ax.fill_between(f, low, high, color=_COLOURS[label], alpha=0.2, lw=0)
             ax.plot(f, power, color=_COLOURS[label], lw=1.2, label=label)
     ax.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="power [(m/s²)²/Hz]")
@@ -265,13 +261,13 @@ def _spectrum(ax: Axes, found: Diagnosis, left: Residuals) -> None:
         along.set_major_formatter("{x:g}")
 
 
-def _correlation(ax: Axes, found: Diagnosis, left: Residuals) -> None:
+def _correlation(ax: Axes, traces: Traces, both: Mapping[str, FloatArray]) -> None:
     """Correlation of the residual with commands before it, and the band of 99 % for one that depends on none."""
     band = 0.0
-    for label, residual in sides(found, left).items():
-        both = left.correlation(residual)
-        ax.plot(both.lag, both.value, color=_COLOURS[label], lw=1.2, label=label)
-        band = both.band
+    for label, residual in both.items():
+        found = correlation(traces, residual)
+        ax.plot(found.lag, found.value, color=_COLOURS[label], lw=1.2, label=label)
+        band = found.band
     ax.axhspan(-band, band, color=GREY, alpha=0.25, lw=0, zorder=0)
     ax.axhline(0.0, color=BLACK, lw=0.8)
     ax.set(xlabel="time since the command [s]", ylabel="correlation [-]")
@@ -284,14 +280,14 @@ def residual_figure(found: Diagnosis, against: Against) -> Figure:
 
     Raises `InputError` where there are no traces.
     """
-    figure, left = Figure(figsize=_SMALL, layout="constrained"), residuals_of(found)
+    figure, traces, both = Figure(figsize=_SMALL, layout="constrained"), traces_of(found), residuals_of(found)
     ax = figure.add_subplot()
     if against == "frequency":
-        _spectrum(ax, found, left)
+        _spectrum(ax, traces, both)
     elif against == "earlier commands":
-        _correlation(ax, found, left)
+        _correlation(ax, traces, both)
     else:
-        _against(ax, found, left, against)
+        _against(ax, traces, both, against)
     legend(figure, [ax], columns=2, fontsize=8)
     return figure
 
@@ -299,23 +295,16 @@ def residual_figure(found: Diagnosis, against: Against) -> Figure:
 @styled
 def residual_time_figure(found: Diagnosis) -> Figure:
     """The residual over the whole drive, and where 99 % of a steady one with the same quartiles would lie."""
-    traces, left, axis = traces_of(found), residuals_of(found), drive_time(found)
-    along = axis.along[np.searchsorted(_rising(traces.time, traces.stretch), _rising(left.time, left.stretch))]
+    traces, axis, both = traces_of(found), drive_time(found), residuals_of(found)
     figure, (ax,) = panels_of(1, 2.6)
-    usual = 0.0
-    for label, residual in sides(found, left).items():
-        line = envelope(along, residual, left.stretch, _INTERVALS)
+    for label, residual in both.items():
+        line = envelope(axis.along, residual, traces.stretch, _INTERVALS)
         ax.plot(*line, color=_COLOURS[label], lw=0.9, label=label)
-        usual = left.usual(residual)
-    ax.axhspan(-usual, usual, color=GREY, alpha=0.25, lw=0, zorder=0)
+    most = usual(list(both.values())[-1])
+    ax.axhspan(-most, most, color=GREY, alpha=0.25, lw=0, zorder=0)
     ax.set(xlabel=axis.label, ylabel="residual [m/s²]", xlim=(float(axis.along[0]), float(axis.along[-1])))
     legend(figure, [ax])
     return figure
-
-
-def _rising(time: FloatArray, stretch: FloatArray | np.ndarray) -> FloatArray:
-    """A key of rows that rises over all stretches, of which several logs may have the same times."""
-    return stretch * 1e7 + time
 
 
 # what to drive next ------------------------------------------------------------------------------------------------

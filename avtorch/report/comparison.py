@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from avtorch.gap.quantity import Quantity, unit_of, words_of
+from avtorch.gap.quantity import Quantity, unit_behind, words_of
 from avtorch.report.page import Origin, Page, Picture, Section, Tone, picture_of
 from avtorch.report.table import Table
 
@@ -84,7 +84,7 @@ def _cause_table(cause: ChangeCause | None) -> Table:
         for key, q in part.parameters.items():
             side = next((s for s in ("before", "after") if key.startswith(s)), "change")
             word = "" if key.startswith(side) else f"{words_of(key)} "
-            cells[f"{side} (90 %)"].append(f"{word}{_told(q)}{_unit(key)}")
+            cells[f"{side} (90 %)"].append(f"{word}{_told(q)}{unit_behind(key)}")
         alike = ", ".join(name for name in part.alias_set if name != part.name) or "nothing"
         name = f"{'less ' if part.less else ''}{part.name}"
         rows.append((name, f"{part.probability:.2f}", *map("; ".join, cells.values()), alike))
@@ -166,7 +166,7 @@ def _of_simulators(found: SimulatorComparison, notes: Sequence[str]) -> Page:
 def _side(values: Mapping[str, float] | None) -> str:
     if values is None:
         return "none"
-    return ", ".join(f"{words_of(key)} {x:.3g}{_unit(key)}" for key, x in values.items())
+    return ", ".join(f"{words_of(key)} {x:.3g}{unit_behind(key)}" for key, x in values.items())
 
 
 # both --------------------------------------------------------------------------------------------------------------
@@ -190,8 +190,3 @@ def _row_name(name: str, horizon_s: float) -> str:
 
 def _told(q: Quantity) -> str:
     return f"{q.mean:.3g} ({q.q05:.3g} to {q.q95:.3g})"
-
-
-def _unit(key: str) -> str:
-    unit = unit_of(key)
-    return "" if unit == "-" else f" {unit}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -15,7 +15,9 @@ from avtorch.gap.result import sentences
 from avtorch.gap.result.budget import percent as share_of
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.manoeuvres import manoeuvres
-from avtorch.gap.result.residuals import BLOCK_S, BinnedMeans, Residuals
+from avtorch.gap.result.residuals import BLOCK_S, BinnedMeans, Correlation, binned_means, correlation, spectrum, usual
+from avtorch.gap.result.traces import Traces
+from avtorch.gap.simulator.force_table import ForceTable
 from avtorch.plots import diagnosis as drawings
 from avtorch.plots import drive
 from avtorch.report.diagnosis_tables import (
@@ -137,11 +139,7 @@ def _rest(found: Diagnosis) -> tuple[str, ...]:
 def _words(found: Diagnosis) -> list[str]:
     told = [line for line in sentences.budget(found) if line not in _rest(found)]
     lines = [*sentences.tested(found), *told, found.verdict.why, sentences.aliases(found)]
-    lines += [*sentences.onset(found), *sentences.shrinkage(found)]
-    if found.setting is not None:
-        why = str(found.setting["why"])
-        lines.append(why if why.startswith("Nothing to set") else f"To set: {why}")
-    return lines
+    return [*lines, *sentences.onset(found), *sentences.shrinkage(found), *sentences.to_set(found)]
 
 
 def _budget(found: Diagnosis) -> Picture | None:
@@ -149,47 +147,40 @@ def _budget(found: Diagnosis) -> Picture | None:
     budget = found.budget
     if budget is None:
         return None
-    (rest, noise), over = budget.error, f"the squared error of {budget.horizon_s:.3g} s simulations"
+    rest, over = budget.unexplained, f"the squared error of {budget.horizon_s:.3g} s simulations"
+    told = ", ".join(f"{name} {share_of(share.mean)}" for name, share in budget.shares.items())
     if budget.parts:
-        rest_of = budget.unexplained
-        shares = [(part.name, part.share) for part in budget.parts]
-        shares += [] if rest_of.carried is None else [("a force without a name", rest_of.carried)]
-        shares += [("unexplained", rest_of.beyond_carried)]
-        told = ", ".join(f"{name} {100 * share.mean:.0f} %" for name, share in shares)
         says = f"Bars of what each effect contributes to the gap: {told}."
         caption = (
             f"A share is what an effect takes off {over}, above that of noise alone, on parts of the drive not used "
             "for fitting; effects are added in the order shown. Black lines: 90 % intervals."
-            + ("" if rest_of.carried is None else " The repaired simulator carries the force that has no name.")
+            + ("" if rest.carried is None else " The repaired simulator carries the force that has no name.")
         )
     else:
-        says = (
-            "Bars of what the error of the baseline simulator consists of: "
-            f"unexplained {share_of(rest.mean)}, noise {share_of(noise.mean)}."
-        )
-        counts = "What is unexplained does not count: it is too little, or not sure." if rest.mean else ""
-        counts = f"{counts} The error is {budget.unexplained.rest(budget.material)}.".strip()
+        says = f"Bars of what the error of the baseline simulator consists of: {told}."
+        counts = "What is unexplained does not count: it is too little, or not sure." if budget.left_above_noise else ""
+        counts = f"{counts} The error is {rest.rest(budget.material)}.".strip()
         caption = (
             f"Shares of {over} by the baseline, on parts of the drive not used for fitting. Noise is what commands, "
             "speed and place do not predict; what is unexplained is reproducible, and no known effect reduces it. "
             "Black lines: 90 % intervals."
-            f"{'' if budget.unexplained.material else f' {counts}'}"
+            f"{'' if rest.material else f' {counts}'}"
         )
     table = budget_table(budget, found.log.epochs_s[0])
     return picture_of("budget", drawings.budget_figure(found), table, says=says, caption=caption, opened=True)
 
 
 def _free_form(found: Diagnosis) -> Picture | None:
-    form = found.free_form
-    if form is None or not form.sizes.any:
+    if not found.free_form:
         return None
-    columns, values = ["speed [m/s]"], [form.knots_v]
-    if form.sizes.table > 0:
-        columns += [f"force beyond K u at {x:.2g} m/s² [m/s²]" for x in form.knots_u]
-        values += list(form.at.table)
-    if form.sizes.resistance > 0:
-        columns.append("resistance [m/s²]")
-        values.append(form.at.curve)
+    columns, values = ["speed [m/s]"], [found.free_form[0].speed_mps]
+    for part in found.free_form:
+        if isinstance(part, ForceTable):
+            columns += [f"force beyond K u at {x:.2g} m/s² [m/s²]" for x in part.command_mps2]
+            values += part.force_mps2
+        else:
+            columns.append("resistance [m/s²]")
+            values.append(part.force_mps2)
     rows = tuple(tuple(f"{x:.3g}" for x in row) for row in zip(*values, strict=True))
     return picture_of(
         "free_form",
@@ -302,22 +293,19 @@ def _which(found: Diagnosis) -> Picture:
 
 
 def _shrinkage(found: Diagnosis) -> Section:
-    """Errors on data held out; over several horizons as a picture."""
+    """Errors on data held out."""
     title, scores = "How far the gap shrinks", found.shrinkage
-    if scores is None or not scores.by_metric:
+    if scores is None:
         return Section(title)
     others = "the other drives" if scores.by_drives else "the other folds"
     how = (
         f"Cross-validated on {scores.blocks} blocks of the drives: each is scored by a simulator selected and fitted "
         f"on {others} alone."
     )
-    measures = measure_table(scores)
-    if len({metric.horizon_s for metric in scores.by_metric.values()}) < 2:
-        return Section(title, (how,), tables=(measures,))
     drawn = picture_of(
         "shrinkage",
         drawings.shrinkage_figure(found),
-        measures,
+        measure_table(scores),
         caption="Bold in the table: the measure that decides.",
         opened=True,
     )
@@ -367,27 +355,22 @@ def _manoeuvres(found: Diagnosis) -> Section:
 # what is left of the gap -------------------------------------------------------------------------------------------
 def _residuals(found: Diagnosis) -> Section:
     """The residuals of a diagnosis; nothing where there is too little to show."""
-    title = "What is left: residuals"
-    if found.traces is None or len(found.traces.time) < _LEAST:
+    title, traces = "What is left: residuals", found.traces
+    if traces is None or len(traces.time) < _LEAST:
         return Section(title)
-    left = drive.residuals_of(found)
-    if len(left.time) < _LEAST:
-        return Section(title)
-    both = drive.sides(found, left)
-    against: list[tuple[drive.Against, FloatArray]] = [("command", left.command)]
-    if left.speed is not None:
-        against.append(("speed", left.speed))
-    pictures = [_residual_against(found, left, both, name, axis) for name, axis in against]
+    both = drive.residuals_of(found)
     last = list(both.values())[-1]
+    pictures = [_residual_against(found, traces, both, name, axis) for name, axis in _axes(traces)]
+    outside = correlation(traces, last)
     pictures.append(
         picture_of(
             "residual-correlation",
             drive.residual_figure(found, "earlier commands"),
-            caption=f"Against earlier commands: a residual beyond ±{left.correlation(last).band:.2f}, 99 % of what "
+            caption=f"Against earlier commands: a residual beyond ±{outside.band:.2f}, 99 % of what "
             "chance does, follows the command in a way that the simulator does not.",
         )
     )
-    if left.spectrum(last) is not None:
+    if spectrum(traces, last) is not None:
         pictures.append(
             picture_of(
                 "residual-frequency",
@@ -395,24 +378,24 @@ def _residuals(found: Diagnosis) -> Section:
                 caption="Against frequency: power averaged over windows of 20 s; bands are 90 %.",
             )
         )
-    return Section(title, _what_is_left(left, both), (_residual_over_time(found, left, both),), tuple(pictures))
+    said = _what_is_left(traces, both, outside)
+    return Section(title, said, (_residual_over_time(found, traces, both),), tuple(pictures))
 
 
-def _what_is_left(left: Residuals, both: Mapping[str, FloatArray]) -> tuple[str, ...]:
+def _axes(traces: Traces) -> list[tuple[Literal["command", "speed"], FloatArray]]:
+    return [("command", traces.command), *([] if traces.speed is None else [("speed", traces.speed)])]
+
+
+def _what_is_left(traces: Traces, both: Mapping[str, FloatArray], outside: Correlation) -> tuple[str, ...]:
     what = (
         "Measured acceleration less that of a rollout over the whole drive"
-        if left.channel == "accel"
+        if "accel" in traces.channels
         else "Slope over 1 s of the measured speed less that of a rollout over the whole drive"
     )
     sizes = [f"{np.sqrt(np.mean(residual**2)):.2g} m/s² {label}" for label, residual in both.items()]
     said = [f"{what}: {', '.join(sizes)} (root mean square)."]
-    judged = list(both.values())[-1]
-    shows = [
-        name
-        for name, axis in (("command", left.command), ("speed", left.speed))
-        if axis is not None and _apart(left.against(axis, judged))
-    ]
-    outside = left.correlation(judged)
+    last = list(both.values())[-1]
+    shows = [name for name, axis in _axes(traces) if _apart(binned_means(traces, axis, last))]
     late = outside.lag[(outside.lag >= 0) & (np.abs(outside.value) > outside.band)]
     who = "The simulator with what was named" if len(both) > 1 else "The baseline simulator"
     if shows:
@@ -430,17 +413,17 @@ def _apart(bins: BinnedMeans) -> bool:
     return int(((bins.low > 0) | (bins.high < 0))[known].sum()) > max(2, 0.3 * int(known.sum()))
 
 
-def _residual_over_time(found: Diagnosis, left: Residuals, both: Mapping[str, FloatArray]) -> Picture:
+def _residual_over_time(found: Diagnosis, traces: Traces, both: Mapping[str, FloatArray]) -> Picture:
     columns = ("part of the drive [s]", *(f"{what} {label} [m/s²]" for label in both for what in ("mean", "SD")))
     rows = [
         (
-            f"{left.time[part[0]]:.0f} to {left.time[part[-1]]:.0f}",
+            f"{traces.time[part[0]]:.0f} to {traces.time[part[-1]]:.0f}",
             *(f"{size:.3f}" for residual in both.values() for size in (residual[part].mean(), residual[part].std())),
         )
-        for part in np.array_split(np.arange(len(left.time)), _PARTS)
+        for part in np.array_split(np.arange(len(traces.time)), _PARTS)
     ]
     judged = list(both.values())[-1]
-    beyond = f"{100 * float(np.mean(np.abs(judged) > left.usual(judged))):.1f} %"
+    beyond = f"{100 * float(np.mean(np.abs(judged) > usual(judged))):.1f} %"
     return picture_of(
         "residual-time",
         drive.residual_time_figure(found),
@@ -451,12 +434,12 @@ def _residual_over_time(found: Diagnosis, left: Residuals, both: Mapping[str, Fl
 
 
 def _residual_against(
-    found: Diagnosis, left: Residuals, both: Mapping[str, FloatArray], name: drive.Against, axis: FloatArray
+    found: Diagnosis, traces: Traces, both: Mapping[str, FloatArray], name: drive.Against, axis: FloatArray
 ) -> Picture:
     unit = "m/s²" if name == "command" else "m/s"
     rows = []
     for label, residual in both.items():
-        bins = left.against(axis, residual)
+        bins = binned_means(traces, axis, residual)
         for place, mean, low, high in zip(bins.place, bins.mean, bins.low, bins.high, strict=True):
             within = f" ({low:.3f} to {high:.3f})" if np.isfinite(low) else ""
             rows.append((f"{place:.3g} {unit}", label, f"{mean:.3f}{within}"))

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from avtorch.gap.engine.family import FORMS
-from avtorch.gap.quantity import Quantity, unit_of, words_of
+from avtorch.gap.quantity import Quantity, unit_behind, words_of
 from avtorch.gap.result import budget as budget_parts
 from avtorch.gap.result import sentences
-from avtorch.gap.result.attribution import UNITS
-from avtorch.gap.result.budget import Budget
+from avtorch.gap.result.budget import UNNAMED, Budget, Part
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.gap_size import Shrinkage
 from avtorch.gap.result.manoeuvres import Manoeuvre
@@ -36,23 +35,15 @@ def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
     several = any(len(part.alias_set) > 1 for part in (*budget.parts, *budget.chance))
     chance = "probability of it or an alias" if several else "probability"
     columns = ("effect", share, chance, "parameters (90 %)", "aliases, not told apart")
-    named = [(part, percent(part.share)) for part in budget.parts]
-    rows = []
-    for part, share in [*named, *((part, "by chance, part of the noise") for part in budget.chance)]:
+    places, rows = budget.unexplained.places(epoch_s), []
+    for part in (*budget.parts, *budget.chance):
+        share = percent(part.share) if isinstance(part, Part) else "by chance, part of the noise"
         parameters = _parameters(part.parameters or {}) + ([] if part.plausible else [_IMPLAUSIBLE])
         alike = ", ".join(name for name in part.alias_set if name != part.name)
         rows.append((part.name, share, sentences.number(part.probability), "; ".join(parameters), alike))
-    places, (rest, noise) = budget.unexplained.places(epoch_s), budget.error
-    if budget.parts:
-        carried = budget.unexplained.carried
-        if carried is not None:
-            rows.append(("a force without a name", percent(carried), "", "in the repaired simulator", ""))
-        rows.append(("unexplained", percent(budget.unexplained.beyond_carried), "", places, ""))
-    else:
-        rows += [
-            ("unexplained", percent(rest), "", places, ""),
-            ("noise", percent(noise), "", "", ""),
-        ]
+    about = {UNNAMED: "in the repaired simulator", "unexplained": places}
+    others = {name: share for name, share in budget.shares.items() if name not in {part.name for part in budget.parts}}
+    rows += [(name, percent(share), "", about.get(name, ""), "") for name, share in others.items()]
     return Table("The gap's budget", columns, tuple(rows), numeric=(chance,))
 
 
@@ -120,19 +111,11 @@ def measure_table(shrinkage: Shrinkage) -> Table:
 def place_table(found: Diagnosis) -> Table:
     """The parts of the drive in which the gap lies."""
     columns = ("axis", "part", "share of the effect", "q-value")
-    rows = tuple(_place(found, part) for part in found.where)
-    return Table("Parts of the drive in which the gap lies", columns, rows, numeric=columns[2:])
-
-
-def _place(found: Diagnosis, part: Any) -> tuple[str, str, str, str]:
-    if part.axis == "time":
-        begin, end = (t - found.log.epochs_s[0] for t in (part.begin, part.end))
-        ends = f"{begin:.1f} to {end:.1f} s from the log's start"
-    elif part.axis == "signal":
-        ends = part.begin
-    else:
-        ends = f"{part.begin:.3g} to {part.end:.3g} {UNITS[part.axis]}"
-    return part.axis, ends, f"{100 * part.share:.0f} %", "<1e-12" if part.q_value < 1e-12 else f"{part.q_value:.1g}"
+    rows = []
+    for part in found.where:
+        q_value = "<1e-12" if part.q_value < 1e-12 else f"{part.q_value:.1g}"
+        rows.append((part.axis, part.words(found.log.epochs_s[0]), f"{100 * part.share:.0f} %", q_value))
+    return Table("Parts of the drive in which the gap lies", columns, tuple(rows), numeric=columns[2:])
 
 
 def manoeuvre_name(found: Diagnosis, one: Manoeuvre) -> str:
@@ -188,9 +171,8 @@ def _parameters(parameters: Mapping[str, Quantity]) -> list[str]:
     words, own = [], [key.rpartition(".")[2] for key in parameters]
     for key, q in parameters.items():
         effect, _, name = key.rpartition(".")
-        unit = unit_of(name)
         # a pair's parameters need the effect's name only where both have one of that name
         of = f"{effect}: " if own.count(name) > 1 else ""
         interval = f"{q.mean:.3g} ({q.q05:.3g} to {q.q95:.3g})"
-        words.append(f"{of}{words_of(name)} {interval}{'' if unit == '-' else ' ' + unit}")
+        words.append(f"{of}{words_of(name)} {interval}{unit_behind(name)}")
     return words

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from avtorch.errors import InputError
-from avtorch.gap.result.free_form import drive as free_runs
-from avtorch.gap.result.free_form import knots_of
+from avtorch.gap.result.free_form import Fit, knots_of
 from avtorch.io import Log
 from avtorch.pedals import PedalMap, PedalTable, fit_pedals, write_map
 from avtorch.pedals.fit_map import car_of
@@ -72,12 +71,12 @@ def test_slopes_of_a_closed_loop_are_those_of_its_runs() -> None:
     car = car_of(pieces, 0.17, knots_of(pieces.command, pieces.speed), 0.0)
     x = car.zero + 0.3 * np.random.default_rng(0).normal(size=len(car.zero))
     x[-1] = np.log(0.33)
-    _, slopes = free_runs(car, x, slopes=True)
+    slopes = Fit(car, x).slopes
     for k in range(len(x) - 1):
         step = np.zeros(len(x))
         step[k] = 1e-6
         # straight between knots, and a knot is passed by none of a thousand rows within a millionth
-        difference = (free_runs(car, x + step)[0] - free_runs(car, x - step)[0]) / 2e-6
+        difference = (Fit(car, x + step).errors - Fit(car, x - step).errors) / 2e-6
         assert slopes[:, k] == pytest.approx(difference, abs=1e-4)
 
 

@@ -51,7 +51,8 @@ MATERIAL = 0.03
 """Share from which something counts, unless a user says otherwise: a part of the bare baseline's squared error, what is
 unexplained of the gap."""
 
-_UNNAMED = "a force of command and speed without a name"
+UNNAMED = "a force without a name"
+"""What the repaired simulator carries beside the named effects, in a table."""
 _NOTHING = 1e-3  # of the energy before, below which free runs show no gap
 _SIZES = 48  # draws of the size of a family
 
@@ -219,8 +220,8 @@ class Budget:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Causes that are more likely there than not: parts, the largest first, then those that chance decides."""
-        return tuple(x.name for x in (*self.parts, *self.chance) if x.probability >= LIKELY)
+        """Causes that are named: parts, the largest first, then those that chance decides."""
+        return tuple(x.name for x in (*self.parts, *self.chance))
 
     @property
     def left_above_noise(self) -> float:
@@ -235,6 +236,16 @@ class Budget:
         return Quantity(mean, 0.0, low, high), Quantity(1 - mean, 0.0, 1 - high, 1 - low)
 
     @property
+    def shares(self) -> dict[str, Quantity]:
+        """Of the gap: of each part, of a force without a name, and of what is unexplained; without any part those of
+        `error`."""
+        if not self.parts:
+            return dict(zip(("unexplained", "noise"), self.error, strict=True))
+        carried, rest = self.unexplained.carried, self.unexplained.beyond_carried
+        unnamed = {} if carried is None else {UNNAMED: carried}
+        return {**{part.name: part.share for part in self.parts}, **unnamed, "unexplained": rest}
+
+    @property
     def verdict(self) -> tuple[str, ...]:
         """`names`; without any `("unknown",)` where something material is reproducible, else `("none",)`."""
         return self.names or (("unknown",) if self.unexplained.material else ("none",))
@@ -246,64 +257,41 @@ class Budget:
 
     def __str__(self) -> str:
         """What a person reads first."""
-        if self.names:
-            return self._sentence(lead="")
-        takes_off, rest = f"{_UNNAMED} takes off {percent(self._takes_off)} of", self.unexplained.rest(self.material)
-        if self.unexplained.material:
-            return f"No known effect explains the gap{f', but {takes_off} it' if self._takes_off else ''}."
-        if not self._takes_off and rest == "noise":
-            return "Nothing material is missing."
-        return f"No known effect is missing; {f'{takes_off} the gap' if self._takes_off else f'the error is {rest}'}."
+        return self.said()
 
-    def beside_its_name(self) -> str:
-        """As `str()`, where the sentence before has told the one part that is named."""
-        if len(self.names) != 1 or len(self.parts) != 1:
-            return str(self)
-        return self._sentence(lead=f"That is {percent(self.parts[0].share.mean)} of the gap")
+    def said(self, *, told: bool = False) -> str:
+        """The parts and the force without a name that the repaired simulator carries, the largest first, small ones by
+        their names alone; `told`: the sentence before has told the one part that there is."""
+        if not self.parts and self.unexplained.material:
+            return "No known effect explains the gap."
+        if not self.parts:
+            return f"No known effect is missing; the error is {self.unexplained.rest(self.material)}."
+        carried, rest = self.unexplained.carried, self.unexplained.beyond_carried.mean
+        large = [p for p in self.parts if p.share.mean >= self.material] or [self.parts[0]]
+        small = [p.name if p.plausible else _words(p) for p in self.parts if p not in large]
+        shares = [] if told else [(p.share.mean, _words(p, f"{percent(p.share.mean)} of the gap")) for p in large]
+        if carried is not None and carried.mean >= 0.005:
+            what = f"a force of command and speed without a name ({percent(carried.mean)} of the gap)"
+            shares.append((carried.mean, what))
+        words = ", then ".join(said for _, said in sorted(shares, key=lambda x: -x[0]))
+        lines = [f"that is {percent(self.parts[0].share.mean)} of the gap", words] if told else [f"chiefly {words}"]
+        if rest >= 0.005 and not told and rest > max(share for share, _ in shares):
+            lines = [f"chiefly no known effect explains it ({percent(rest)} of the gap)", words]
+            rest = 0.0
+        if small:
+            lines.append(f"under {percent(self.material)}{' each' if small[1:] else ''}: {listing(small)}")
+        if rest >= 0.005:
+            lines.append(f"{percent(rest)} is reproducible and no known effect explains it")
+        text = "; ".join(filter(None, lines)) + "."
+        return text[0].upper() + text[1:]
 
     @property
     def rest(self) -> str:
         """A sentence on the error that is left, beside the named causes; empty without any, where `str()` tells it."""
         if not self.names:
             return ""
-        by_chance = " and ".join(_words(c) for c in self.chance if c.probability >= LIKELY)
-        noise = self.unexplained.rest(self.material)
+        by_chance, noise = " and ".join(map(_words, self.chance)), self.unexplained.rest(self.material)
         return f"The rest of the error is {f'in part this: {by_chance}; else {noise}' if by_chance else noise}."
-
-    def _sentence(self, lead: str) -> str:
-        """The named parts and the force without a name that the repaired simulator carries, the largest first; small
-        ones by their names alone."""
-        named = [p for p in self.parts if p.probability >= LIKELY]
-        large = [p for p in named if p.share.mean >= self.material] or named[:1]
-        small = [
-            p.name if p.plausible else f"{p.name} (physically implausible as fitted)" for p in named if p not in large
-        ]
-        shares = [(p.share.mean, _words(p, f"{percent(p.share.mean)} of the gap")) for p in large]
-        lines = []
-        if lead:
-            lines, shares = [lead], []
-        if self._takes_off and (named or self.unexplained.material):
-            shares.append((self._takes_off, f"{_UNNAMED} ({percent(self._takes_off)} of the gap)"))
-        words = [said for _, said in sorted(shares, key=lambda x: -x[0])]
-        if words:
-            lines.append(f"{'' if lead else 'chiefly '}{', then '.join(words)}")
-        if small:
-            lines.append(f"under {percent(self.material)}{' each' if small[1:] else ''}: {listing(small)}")
-        rest = self.unexplained.beyond_carried.mean
-        if rest >= 0.005 and named:
-            if not lead and rest > max(share for share, _ in shares):
-                lines[0] = lines[0].replace("chiefly ", "", 1)
-                lines.insert(0, f"chiefly no known effect explains it ({percent(rest)} of the gap)")
-            else:
-                lines.append(f"{percent(rest)} is reproducible and no known effect explains it")
-        text = "; ".join(lines) + "."
-        return text[0].upper() + text[1:]
-
-    @property
-    def _takes_off(self) -> float:
-        """What of the gap the repaired simulator takes off without a name; 0 where that is next to nothing."""
-        carried = self.unexplained.carried
-        return 0.0 if carried is None or carried.mean < 0.005 else carried.mean
 
     def to_dict(self) -> dict[str, Any]:
         """The object `budget` of `diagnosis.json`."""
@@ -350,7 +338,7 @@ def budget_of(
     free run foretells them. `material`: share of the gap from which what is unexplained is said to matter, where
     nothing is named by what the evidence says: with `unknown` it does, with `none` it does not.
     """
-    energy, floor = _energies(held)
+    energy, floor = np.stack([held.energy(x) for x in held.steps]), held.energy(held.floor)  # (model, block), (block,)
     draws = _shares(energy, floor, seed)
     shares = {name: draws[:, k] for k, name in enumerate(held.names)}
     by_effect = posterior.by_effect()
@@ -389,7 +377,7 @@ def budget_of(
     most = max(sum(p.share.mean for p in parts), 1.0)  # an effect without a name may cost instead of taking off
     parts = [replace(p, share=p.share.scaled(1 / most)) for p in parts]
     carried = shares.get("free form")
-    by_chance = [ChancePart(**about(n), share_of_noise=_share_of_noise(posterior, n)) for n in names if n in chance]
+    by_chance = (ChancePart(**about(n), share_of_noise=_share_of_noise(posterior, n)) for n in names if n in chance)
     return Budget(
         before=float(np.sqrt(energy[0].mean() / bottom)),
         left=float(np.sqrt(energy[-1].mean() / bottom)),
@@ -403,7 +391,7 @@ def budget_of(
             carried=None if carried is None else Quantity.of_resampled(carried[0], carried),
         ),
         repaired=repaired,
-        chance=tuple(part for part in by_chance if part.probability >= LIKELY),
+        chance=tuple(by_chance),
         material=material,
         horizon_s=held.horizon_s,
         by_drives=held.blocks.by_drives,
@@ -475,13 +463,6 @@ def least_visible(h: Hypothesis, among: Sequence[str]) -> Mapping[str, tuple[flo
 
 
 # inside ---------------------------------------------------------------------------------------------------------------
-def _energies(held: HeldOut) -> tuple[FloatArray, FloatArray]:
-    """Energies (model, block) of the chain and (block,) of the floor, each channel over its own floor."""
-    levels, bottom = np.stack([x.squares for x in held.steps]), held.floor.squares  # model, channel, block
-    scale = np.maximum(bottom.mean(1), 1e-12)[:, None]
-    return (levels / scale).mean(1), (bottom / scale).mean(0)
-
-
 def _levels(held: HeldOut) -> list[ChannelError]:
     """Root mean squares before, at the floor and left, a channel."""
     three = np.stack([x.squares.sum(1) for x in (held.steps[0], held.floor, held.steps[-1])])
@@ -590,9 +571,7 @@ def _takes_off(held: HeldOut, family: str, seed: int) -> Quantity | None:
     without = held.apart.get(family)
     if without is None:
         return None
-    before, after, floor = (x.squares for x in (held.steps[0], held.steps[-1], held.floor))
-    scale = np.maximum(floor.mean(1), 1e-12)[:, None]
-    before, after, less, floor = ((x / scale).mean(0) for x in (before, after, without.squares, floor))
+    before, after, less, floor = (held.energy(x) for x in (held.steps[0], held.steps[-1], without, held.floor))
     whole = np.maximum(resampled(before - floor, seed), 1e-9)
     draws = np.clip(resampled(less - after, seed) / whole, 0.0, 1.0)
     return Quantity.of_resampled(draws[0], draws)

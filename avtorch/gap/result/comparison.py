@@ -24,7 +24,7 @@ from avtorch.gap.engine.coordinates import adopt
 from avtorch.gap.engine.hypothesis import Hypothesis, table_effect
 from avtorch.gap.engine.joint import Change as JointChange
 from avtorch.gap.engine.joint import JointFit, JointModel, of_car
-from avtorch.gap.quantity import Quantity, of_fields, plain, unit_of, words_of
+from avtorch.gap.quantity import Quantity, of_fields, plain, unit_behind, unit_of, words_of
 from avtorch.gap.result.hypotheses import LIKELY
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.simulator.effect import Effect
@@ -175,9 +175,8 @@ def is_change(key: str) -> bool:
 
 
 def _text(key: str, q: Quantity) -> str:
-    unit = unit_of(key)
     word = "" if key.startswith("change") else f"{words_of(key)} "
-    return f"{word}{q.mean:+.3g}{'' if unit == '-' else ' ' + unit}, 90 % {q.q05:.3g} to {q.q95:.3g}"
+    return f"{word}{q.mean:+.3g}{unit_behind(key)}, 90 % {q.q05:.3g} to {q.q95:.3g}"
 
 
 # the cause ------------------------------------------------------------------------------------------------------------

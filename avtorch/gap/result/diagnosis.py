@@ -49,6 +49,7 @@ class Diagnosis(Displayed, Findings):
     - `candidates`: the hypotheses as `listed_candidates` orders them, whatever the order given
     - `simulator`: the user's own, with `T_L` and `K_L` fitted without any effect; `plant`: the same with the verdict's
       effects, at the posterior mode, and a `free_form` where that foretells more; None where there is neither
+    - `free_form`: its effects, none where `plant` only has the gain of free runs; None where it has neither
     - `assumed`: draws (draw,) of the simulator's `T_L` [s] and `K_L`; `belief`: draws (draw,) of the parameters of
       `plant`, or of `simulator` where there is none, by its own names; `draws`: posterior of the winner's parameters
       (chain, draw) by the table's names
@@ -167,25 +168,21 @@ class Diagnosis(Displayed, Findings):
         with answer_set(folder, DIAGNOSIS_FILES) as staged:
             if self.plant is not None:
                 with atomic(staged / "plant.toml") as stream:
-                    stream.write(self._late() + self._random() + self.plant.to_toml())
+                    stream.write(self._comments(self.plant) + self.plant.to_toml())
             write_json(staged / "diagnosis.json", self.to_dict())
         return [Path(folder) / name for name in names]
 
-    def _late(self) -> str:
-        """Comments for `plant.toml` where effects have an onset within the log."""
-        kinds = [*EFFECTS.values(), *(() if self.plant is None else self.plant.effects)]
-        own = {e.name for e in kinds if e.own_onset is not None}
+    def _comments(self, plant: GapPlant) -> str:
+        """Of `plant.toml`: on effects with an onset within the log, and on those that chance decides."""
+        own = {e.name for e in (*EFFECTS.values(), *plant.effects) if e.own_onset is not None}
         late = " and ".join(name for name in self.verdict.names if name not in own)
-        if self.onset_s is None or not late:
-            return ""
-        return f"# In the log {late} from {sentences.moment(self)} on; in this plant from the start.\n"
-
-    def _random(self) -> str:
-        """A comment for `plant.toml` where chance decides some of its effects."""
-        names = [] if self.plant is None else [e.name for e in self.plant.effects if e.random]
-        return (
-            f"# By chance, drawn anew in every drive and not part of `closed`: {', '.join(names)}.\n" if names else ""
-        )
+        random = ", ".join(e.name for e in plant.effects if e.random)
+        out = ""
+        if self.onset_s is not None and late:
+            out += f"# In the log {late} from {sentences.moment(self)} on; in this plant from the start.\n"
+        if random:
+            out += f"# By chance, drawn anew in every drive and not part of `closed`: {random}.\n"
+        return out
 
     def to_arviz(self) -> InferenceData:
         """The winner's draws as `arviz.InferenceData`, one variable (chain, draw) per parameter, its unit in `attrs`.

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.attribution import Location
 from avtorch.gap.result.budget import Budget
-from avtorch.gap.result.free_form import FreeForm
 from avtorch.gap.result.gap_size import GapSize, Shrinkage
 from avtorch.gap.result.hypotheses import AnswerPart, Candidate, Scope, Verdict, candidate_name, listed_candidates
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
 from avtorch.gap.result.traces import Alarm, Traces
+from avtorch.gap.simulator.force_table import ForceTable, ResistanceCurve
 from avtorch.gap.simulator.plant import GapPlant
 
 
@@ -51,7 +51,7 @@ class Findings:
     tested: SimulatorUnderTest | None = None
     alarms: tuple[Alarm, ...] = ()
     parts: tuple[AnswerPart, ...] = ()
-    free_form: FreeForm | None = None
+    free_form: tuple[ForceTable | ResistanceCurve, ...] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "candidates", listed_candidates(self.candidates))

@@ -38,7 +38,7 @@ from avtorch.gap.result.counted_rows import HORIZON_S
 from avtorch.gap.result.output_error import SETTLED_S, STEP_S, Coefficients, Rows, Runs
 from avtorch.gap.simulator.chain import at_place
 from avtorch.gap.simulator.effect import EffectContext
-from avtorch.gap.simulator.force_table import ForceTable, ResistanceCurve
+from avtorch.gap.simulator.force_table import FREE_FORMS, ForceTable, ResistanceCurve
 from avtorch.gap.simulator.plant import GapPlant, plant
 
 INDEPENDENT_S = 2.0
@@ -90,40 +90,6 @@ class Sizes:
 
 _STARTS = (Sizes(0.1, 0.0), Sizes(0.3, 0.3))
 _DESCENTS = 3
-
-
-@dataclass(frozen=True, eq=False)
-class FreeForm:
-    """Coefficients at `knots_u` (u,) [m/s²] and `knots_v` (v,) [m/s] beside a named car of lag `T_L` [s]."""
-
-    knots_u: FloatArray
-    knots_v: FloatArray
-    at: Coefficients
-    sizes: Sizes
-    T_L: float
-
-    @property
-    def words(self) -> str:
-        """What it is."""
-        table = ["a force map of command and speed"] if self.sizes.table > 0 else []
-        curve = ["a resistance that depends on the speed"] if self.sizes.resistance > 0 else []
-        return " and ".join([*table, *curve]) or "a gain that free runs teach"
-
-    def effects(self) -> list[ForceTable | ResistanceCurve]:
-        """As effects of a plant."""
-        u, v, curve = (tuple(x.round(_DIGITS).tolist()) for x in (self.knots_u, self.knots_v, self.at.curve))
-        out: list[ForceTable | ResistanceCurve] = []
-        if self.sizes.table > 0:
-            out.append(ForceTable(u, v, tuple(tuple(row) for row in self.at.table.round(_DIGITS).tolist())))
-        if self.sizes.resistance > 0:
-            out.append(ResistanceCurve(v, curve))
-        return out
-
-    def beside(self, car: GapPlant) -> GapPlant:
-        """The car with the free form, without the gust of which it takes a part: what is left of that is not known."""
-        still = torch.zeros(8, dtype=torch.float64)
-        kept = [e for e in car.effects if (change := e.noise(still)) is None or change.force_sd is None]
-        return plant([*kept, *self.effects()], T_L=self.T_L, K_L=float(car.K_L) + self.at.gain, sigma=float(car.sigma))
 
 
 # the car's runs -------------------------------------------------------------------------------------------------------
@@ -302,27 +268,44 @@ _LAG_STEP = 0.05  # of ln T_L, for its slope
 
 
 class Fit:
-    """Coefficients `x` (table, curve, gain, ln T_L) with the errors (error,) and slopes (error, coefficient) there."""
+    """Coefficients `x` (table, curve, gain, ln T_L) with the errors (error,) and slopes (error, coefficient) there.
+
+    `cut`: of runs of which none goes beyond its block."""
 
     def __init__(self, car: Car, x: FloatArray, *, cut: bool = False) -> None:
         self.car, self.x = car, x
         self.runs = car.runs_in_blocks if cut else car.runs
-        self.errors, slopes = drive(car, x, slopes=True, cut=cut)
-        aside = x.copy()
+        self.errors, self._slopes = self._driven(x)
+
+    @cached_property
+    def slopes(self) -> FloatArray:
+        """By the coefficients, that of the lag by a finite difference."""
+        aside = self.x.copy()
         aside[-1] += _LAG_STEP
-        lagged = (drive(car, aside, cut=cut)[0] - self.errors) / _LAG_STEP
-        self.slopes = np.column_stack([slopes, lagged])
+        return np.column_stack([self._slopes, (self._driven(aside)[0] - self.errors) / _LAG_STEP])
 
+    @property
+    def mse(self) -> float:
+        """Mean squared error [m²/s²]."""
+        return max(float((self.errors**2).mean()), 1e-8)
 
-def drive(car: Car, x: FloatArray, *, slopes: bool = False, cut: bool = False) -> tuple[FloatArray, FloatArray]:
-    """Errors (error,) of the runs at coefficients, and their slopes but for ln T_L."""
-    runs, log_lag = car.runs_in_blocks if cut else car.runs, float(x[-1])
-    at = Coefficients.of(x[:-1], car.rows.shape)
-    errors, by = runs.drive(car.named(log_lag), float(np.exp(log_lag)), at, slopes=slopes)
-    if car.kept:
-        errors = _whitened(errors, runs.of_run, car.kept)
-        by = _whitened(by, runs.of_run, car.kept) if slopes else by
-    return errors, by
+    @property
+    def at(self) -> Coefficients:
+        """The coefficients but for the lag."""
+        return Coefficients.of(self.x[:-1], self.car.rows.shape)
+
+    @property
+    def T_L(self) -> float:
+        """[s]"""
+        return float(np.exp(self.x[-1]))
+
+    def _driven(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        car = self.car
+        at = Coefficients.of(x[:-1], car.rows.shape)
+        errors, slopes = self.runs.drive(car.named(float(x[-1])), float(np.exp(x[-1])), at)
+        if car.kept:
+            return _whitened(errors, self.runs.of_run, car.kept), _whitened(slopes, self.runs.of_run, car.kept)
+        return errors, slopes
 
 
 def _whitened(x: FloatArray, of_run: IntArray, kept: float) -> FloatArray:
@@ -337,25 +320,28 @@ def fitted(car: Car, sizes: Sizes, x: FloatArray, independent: float) -> Fit:
     """Levenberg and Marquardt from `x`."""
     prior = Prior(car, sizes)
     m = prior.moves
+
+    def cost(fit: Fit) -> float:
+        return independent * np.log(fit.mse) + prior.of(fit.x)
+
     now, damp = Fit(car, np.where(m, x, prior.mean)), 1e-3
     for _ in range(_ROUNDS):
-        mse = max(float((now.errors**2).mean()), 1e-8)
-        value = independent * np.log(mse) + prior.of(now.x)
-        J, k = now.slopes[:, m], independent / (len(now.errors) * mse)
+        J, k = now.slopes[:, m], independent / (len(now.errors) * now.mse)
         H = k * J.T @ J + prior.precision
         g = k * J.T @ now.errors + prior.precision @ (now.x - prior.mean)[m]
         for _ in range(5):
-            new = now.x.copy()
-            new[m] -= np.linalg.solve(H + damp * np.diag(np.diag(H)), g)
-            new[-1] = np.clip(new[-1], np.log(0.02), np.log(5.0))
-            after = independent * np.log(max(float((drive(car, new)[0] ** 2).mean()), 1e-8)) + prior.of(new)
-            if after < value:
+            x = now.x.copy()
+            x[m] -= np.linalg.solve(H + damp * np.diag(np.diag(H)), g)
+            x[-1] = np.clip(x[-1], np.log(0.02), np.log(5.0))
+            new = Fit(car, x)
+            gain = cost(now) - cost(new)
+            if gain > 0:
                 break
             damp = max(6 * damp, 1e-3)
         else:
             break
-        now, damp = Fit(car, new), max(damp / 6, 1e-6)
-        if value - after < 0.01:
+        now, damp = new, max(damp / 6, 1e-6)
+        if gain < 0.01:
             break
     return now
 
@@ -453,7 +439,7 @@ class Products:
 
 @dataclass(frozen=True, eq=False)
 class FittedForm:
-    """A free form beside a hypothesis; without a table and a resistance it is the gain of free runs.
+    """A free form of `sizes` beside a hypothesis; without a table and a resistance it is the gain of free runs.
 
     On blocks left out, as logarithms of the mean squared error over that of the baseline, whose gain the same blocks
     teach, each by the worse way of leaving out: `score`, with what the form costs, `named`, of the hypothesis by
@@ -461,32 +447,52 @@ class FittedForm:
     """
 
     hypothesis: Hypothesis
-    form: FreeForm
+    fit: Fit = field(repr=False)
+    sizes: Sizes
     score: float
     named: float
     bare: float
-    car: Car = field(repr=False)
-    x: FloatArray = field(repr=False)
     independent: float
 
     def earns_its_place(self, *, named: bool) -> bool:
         """Whether it foretells blocks left out better than what is handed back without it: names, or the baseline."""
         return self.score < (self.named if named else self.bare)
 
+    @property
+    def words(self) -> str:
+        """What it is."""
+        table = ["a force map of command and speed"] if self.sizes.table > 0 else []
+        curve = ["a resistance that depends on the speed"] if self.sizes.resistance > 0 else []
+        return " and ".join([*table, *curve]) or "a gain that free runs teach"
+
+    def effects(self) -> tuple[ForceTable | ResistanceCurve, ...]:
+        """As effects of a plant."""
+        rows, at = self.fit.car.rows, self.fit.at
+        u, v, curve = (tuple(x.round(_DIGITS).tolist()) for x in (rows.knots_u, rows.knots_v, at.curve))
+        table = tuple(tuple(row) for row in at.table.round(_DIGITS).tolist())
+        tables = [ForceTable(u, v, table)] if self.sizes.table > 0 else []
+        return (*tables, *([ResistanceCurve(v, curve)] if self.sizes.resistance > 0 else []))
+
+    def beside(self, car: GapPlant) -> GapPlant:
+        """The car with the free form, without the gust of which it takes a part: what is left of that is not known."""
+        still = torch.zeros(8, dtype=torch.float64)
+        kept = [e for e in car.effects if (change := e.noise(still)) is None or change.force_sd is None]
+        gain = float(car.K_L) + self.fit.at.gain
+        return plant([*kept, *self.effects()], T_L=self.fit.T_L, K_L=gain, sigma=float(car.sigma))
+
     def without(self, without: Sequence[slice]) -> FloatArray:
         """Acceleration [m/s²] on the grid that it adds to the hypothesis at `lagged`, taught by the other rows."""
-        car, rows, runs = self.car, self.car.rows, self.car.runs_in_blocks
+        car, x = self.fit.car, self.fit.x
+        rows, runs = car.rows, car.runs_in_blocks
         first, last = rows.source[runs.counts], rows.source[runs.end - 1]
         held = np.any([(last >= r.start) & (first < r.stop) for r in without], axis=0)
-        x = self.x
         if held.any() and not held.all():
             left = LeftOut(held[None], np.zeros(1, np.int64))
-            products = Products(Fit(car, x, cut=True), left)
-            x = x + products.steps(Prior(car, self.form.sizes), self.independent)[0]
-        at = Coefficients.of(x[:-1], car.rows.shape)
+            x = x + Products(Fit(car, x, cut=True), left).steps(Prior(car, self.sizes), self.independent)[0]
+        at = Coefficients.of(x[:-1], rows.shape)
         force = ForceMap(rows.knots_u, rows.knots_v, at.table, 0.0)(rows.command, rows.speed)
         force = force + at.gain * rows.command
-        keep, lagged = np.exp(-rows.dt / self.form.T_L), np.empty_like(force)
+        keep, lagged = np.exp(-rows.dt / self.fit.T_L), np.empty_like(force)
         begins = np.append(np.flatnonzero(rows.starts), len(force))
         for i, j in itertools.pairwise(begins):
             lagged[i:j] = lfilter([1 - keep], [1, -keep], force[i:j], zi=[keep * force[i]])[0]
@@ -498,17 +504,18 @@ class FittedForm:
     def lagged(self) -> Hypothesis:
         """The hypothesis with the lag that the free form was fitted with."""
         h = self.hypothesis.copy()
-        h["T_L"] = self.form.T_L
+        h["T_L"] = self.fit.T_L
         return h
 
 
 def fitted_form(h: Hypothesis, baseline: GapPlant | None, bare: Hypothesis) -> FittedForm | None:
     """The free form beside a hypothesis (its force map, if any, apart) that does best on blocks left out.
 
-    `bare`: what it is scored over. None where no speed was measured, blocks are too few, or their speed falls as the
-    command rises.
+    `bare`: what it is scored over. None where no speed was measured, blocks are too few, their speed falls as the
+    command rises, or the baseline has a free form of its own.
     """
-    if h.data.speed is None:
+    given = () if baseline is None else baseline.effects
+    if h.data.speed is None or any(isinstance(e, FREE_FORMS) for e in given):
         return None
     h, bare = _as_a_plant(h), _as_a_plant(bare)
     lags = np.log(sample(h, chains=1, draws=_DRAWS, seed=0, method="laplace")["T_L"].reshape(-1))
@@ -522,15 +529,12 @@ def fitted_form(h: Hypothesis, baseline: GapPlant | None, bare: Hypothesis) -> F
     over = squares_of(Fit(base, base.zero, cut=True), Prior(base, Sizes(0.0, 0.0)), left, independent)
 
     def as_it_is(car: Car) -> float:
-        return left.worse(left.squares([drive(car, car.zero, cut=True)[0]] * len(left.told), runs), over)
+        return left.worse(left.squares([Fit(car, car.zero, cut=True).errors] * len(left.told), runs), over)
 
     best = best_form(car, left, over, independent)
-    x, sizes = best.fit.x, best.sizes
-    at = Coefficients.of(x[:-1], car.rows.shape)
-    if h["K_L"] + at.gain <= 0:  # the free runs follow no command
+    if h["K_L"] + best.fit.at.gain <= 0:  # the free runs follow no command
         return None
-    form = FreeForm(car.rows.knots_u, car.rows.knots_v, at, sizes, float(np.exp(x[-1])))
-    return FittedForm(h, form, best.score, as_it_is(car), as_it_is(base), car, x, independent)
+    return FittedForm(h, best.fit, best.sizes, best.score, as_it_is(car), as_it_is(base), independent)
 
 
 def _as_a_plant(h: Hypothesis) -> Hypothesis:
@@ -547,7 +551,7 @@ def _as_a_plant(h: Hypothesis) -> Hypothesis:
 def squares_of(fit: Fit, prior: Prior, left: LeftOut, independent: float) -> FloatArray:
     """Sums of squared errors (fold,) of the told runs, driven with what the other runs of each fold teach."""
     steps = Products(fit, left).steps(prior, independent)
-    return left.squares([drive(fit.car, fit.x + d, cut=True)[0] for d in steps], fit.runs)
+    return left.squares([Fit(fit.car, fit.x + d, cut=True).errors for d in steps], fit.runs)
 
 
 class Best(NamedTuple):

@@ -27,9 +27,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import multigammaln  # pyright: ignore[reportAttributeAccessIssue]
@@ -38,10 +37,10 @@ from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.gap.engine.coordinates import INDEX, base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.family import family_of
-from avtorch.gap.engine.free_forms import band_products
+from avtorch.gap.engine.free_forms import band_products, gram
 from avtorch.gap.engine.gauss_newton import fit, linear_priors, linearised, penalty
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import band_covariance, whiten
+from avtorch.gap.engine.likelihood import band_covariance, least_noise, whiten
 from avtorch.gap.result.counted_rows import HORIZON_S, Blocks, compared, measured_readings, readings, speed_gained
 from avtorch.gap.result.free_form import FittedForm
 
@@ -57,7 +56,6 @@ _PRIOR_SD = np.geomspace(0.001, 3.0, 12)  # of a coefficient [m/s²]
 _POOLED = 200  # coefficients a channel that tell a band's noise: free bands swallow what few coefficients show
 _ROUNDS = 4  # alternations between coefficients and noise
 _BOX_DRAWS = 200  # of the posterior
-_LEAST = 1e-9  # of a covariance's trace, as in `likelihood`
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +78,7 @@ class HeldOut:
     """A chain of nested hypotheses on blocks that taught neither their parameters nor their noise.
 
     `steps`: scores of each hypothesis of `chain`, then of the last one with the `free` form, if there is one; `rival`,
-    `ceiling`: of the last and the first hypothesis with a `BlackBox` on top. `possible` (draw, channel, block): squares
+    `ceiling`: of the last and the first hypothesis with a black box on top. `possible` (draw, channel, block): squares
     of free runs of what the black box may have missed. `horizon_s` of the free runs. `apart`: of the last step without
     a family of causes, by its name, everything else refitted.
     """
@@ -111,18 +109,10 @@ class HeldOut:
         """The rival's, no higher than the last step in any channel."""
         return self.rival.no_worse_than(self.steps[-1])
 
-    def free_gains(self, *, named: bool) -> bool:
-        """Whether the free form lowers the errors of free runs, against the baseline and, where they are `named`,
-        against names alone; its size was chosen by other ways of leaving out."""
-        before = self.steps[0].squares.sum(1)
-        now, names = (float((x.squares.sum(1) / before).mean()) for x in (self.steps[-1], self.steps[-2]))
-        return self.free and now < (min(names, 1.0) if named else 1.0)
-
-    def without_free(self) -> HeldOut:
-        """The same chain without its free form."""
-        if not self.free:
-            return self
-        return replace(self, steps=self.steps[:-1], free=False, apart={})
+    def energy(self, scores: Scores) -> FloatArray:
+        """Squared errors (block,) of free runs, each channel over its own floor, averaged over the channels."""
+        scale = np.maximum(self.floor.squares.mean(1), 1e-12)[:, None]
+        return (scores.squares / scale).mean(0)
 
     @property
     def frame_rows(self) -> FloatArray:
@@ -132,37 +122,46 @@ class HeldOut:
 
 
 def held_out_errors(
-    base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis] = (), free: FittedForm | None = None
+    base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis], free: FittedForm | None, *, named: bool
 ) -> HeldOut | None:
     """The scores of nested hypotheses from `base` to `full`, fitted to all blocks; fits among `visited` are taken as
     they are.
 
-    `free`: a form beside the last, which the repaired simulator carries: what it leaves is the last step. None where
-    the drives are too short for `FEWEST` blocks.
+    `free`: a form beside the last, `named` or not, which the repaired simulator carries where it `gains`: what it
+    leaves is the last step. None where the drives are too short for `FEWEST` blocks.
     """
     data = full.data
     blocks = Blocks.of(data)
     if blocks is None:
         return None
-    chain = _nested(base, full, visited, blocks)
-    fitted = [_taught(h, blocks) for h in chain]
-    steps = [x.scores(blocks) for x in fitted]
-    ends = (fitted[-1], fitted[0])
-    found = [BlackBox.of(x.hypothesis).predict(x.residuals, blocks) for x in ends]
-    rival, ceiling = (x.scores(blocks, beside) for x, beside in zip(ends, found, strict=True))
+    chain = [_without_chance(h) for h in _nested(base, full, visited, blocks)]
+    rows = [_taught(h, blocks) for h in chain]
+    steps = [_scores(data, blocks, x) for x in rows]
+    boxes = [black_box(chain[k], rows[k], blocks) for k in (-1, 0)]
+    rival, ceiling = (_scores(data, blocks, rows[k] + box, rows[k]) for k, (box, _) in zip((-1, 0), boxes, strict=True))
     if free is not None:
-        steps.append(_with_form(free, free.lagged, blocks))
+        carried = _scores(data, blocks, _with_form(free, free.lagged, blocks))
+        free = free if gains(carried, steps[0], steps[-1] if named else None) else None
+        steps += [] if free is None else [carried]
     return HeldOut(
         chain=tuple(chain),
         blocks=blocks,
         steps=tuple(steps),
         rival=rival,
         ceiling=ceiling.no_worse_than(steps[0]),
-        possible=found[0].possible,
+        possible=boxes[0][1],
         horizon_s=min(HORIZON_S, max(rows.stop - rows.start for rows in blocks.rows) * data.dt),
         free=free is not None,
-        apart=_apart(fitted[-1].hypothesis, steps, blocks, free),
+        apart=_apart(chain[-1], steps, blocks, free),
     )
+
+
+def gains(carried: Scores, base: Scores, named: Scores | None) -> bool:
+    """Whether a free form lowers the errors of free runs, against the baseline and against names alone, where there are
+    any; its size was chosen by other ways of leaving out."""
+    others = [x for x in (base, named) if x is not None]
+    now, *than = (float((x.squares.sum(1) / base.squares.sum(1)).mean()) for x in (carried, *others))
+    return now < min(than)
 
 
 def _apart(full: Hypothesis, scored: Sequence[Scores], blocks: Blocks, free: FittedForm | None) -> dict[str, Scores]:
@@ -181,10 +180,10 @@ def _apart(full: Hypothesis, scored: Sequence[Scores], blocks: Blocks, free: Fit
             continue
         rest = fit(rest, 6, 0.1)
         if beside is None:
-            out[family] = _taught(rest, blocks).scores(blocks)
+            out[family] = _scores(rest.data, blocks, _taught(rest, blocks))
         else:
-            rest["T_L"] = float(np.clip(beside.form.T_L * rest["T_L"] / full["T_L"], *rest.limits("T_L")))
-            out[family] = _with_form(beside, rest, blocks)
+            rest["T_L"] = float(np.clip(beside.fit.T_L * rest["T_L"] / full["T_L"], *rest.limits("T_L")))
+            out[family] = _scores(rest.data, blocks, _with_form(beside, rest, blocks))
     if free is not None and "force map" not in out:
         out["force map"] = scored[-2]
     return out
@@ -208,48 +207,15 @@ def _nested(base: Hypothesis, full: Hypothesis, visited: Iterable[Hypothesis], b
 
 
 # fits -----------------------------------------------------------------------------------------------------------------
-@dataclass(frozen=True, eq=False)
-class _Taught:
-    """What fits of a hypothesis without each fold leave: `residuals` (fold, channel, frame, bin) of all frames, and
-    `errors` (channel, row) of readings, each block's by the fit without it."""
-
-    hypothesis: Hypothesis
-    residuals: FloatArray
-    errors: FloatArray
-
-    @classmethod
-    def of(cls, h: Hypothesis, rows: Sequence[FloatArray], blocks: Blocks) -> _Taught:
-        """Of readings (channel, row) by each fold's fit."""
-        data = h.data
-        residuals = np.array([data.measured - data.transform(compared(data, x)) for x in rows])
-        return cls(h, residuals, blocks.stitched([measured_readings(data) - x for x in rows]))
-
-    def scores(self, blocks: Blocks, beside: Predicted | None = None) -> Scores:
-        """Errors of free runs, and densities by the noise that the fits leave, with a black box's predictions `beside`
-        where given."""
-        data, errors, residuals = self.hypothesis.data, self.errors, self.residuals
-        if beside is not None:
-            errors, residuals = errors - blocks.stitched(beside.readings), residuals - beside.coefficients
-        fold = blocks.fold[blocks.block_of_frame]
-        nats = np.zeros(len(fold))
-        for k, frames in enumerate(blocks.taught):
-            own = fold == k
-            nats[own] = _log_density(data.only(frames), self.residuals[k][:, frames], residuals[k][:, own])
-        return Scores(
-            blocks.sums(blocks.free_runs(data, errors) ** 2),
-            np.asarray(np.bincount(blocks.block_of_frame, nats, len(blocks.rows)), np.float64),
-        )
-
-
-def _taught(h: Hypothesis, blocks: Blocks) -> _Taught:
-    h = _without_chance(h)
+def _taught(h: Hypothesis, blocks: Blocks) -> FloatArray:
+    """Readings (fold, channel, row) by the fits without each fold."""
     slopes, *_ = linearised(h, h.free)
     rows = []
     for frames in blocks.taught:
         fold, taught = h.copy(), _fold_fit(h, slopes, frames)
         fold.values, fold.force_coefficients = taught.values, taught.force_coefficients
         rows.append(readings(fold, *fold.on_grid()))
-    return _Taught.of(h, rows, blocks)
+    return np.array(rows)
 
 
 def _fold_fit(h: Hypothesis, slopes: FloatArray, frames: BoolArray) -> Hypothesis:
@@ -309,16 +275,39 @@ def _less(h: Hypothesis, effect: str) -> Hypothesis:
     return rest
 
 
-def _with_form(free: FittedForm, h: Hypothesis, blocks: Blocks) -> Scores:
-    """Of a hypothesis with the free form beside it, which each fold's other blocks teach."""
+def _with_form(free: FittedForm, h: Hypothesis, blocks: Blocks) -> FloatArray:
+    """Readings (fold, channel, row) of a hypothesis with the free form beside it, which each fold's other blocks
+    teach."""
     (accel, gained), rows = h.on_grid(), []
     for k in range(len(blocks.taught)):
         adds = free.without([own for own, fold in zip(blocks.rows, blocks.fold, strict=True) if fold == k])
         rows.append(readings(h, accel + adds, gained + speed_gained(h.data.grid, adds)))
-    return _Taught.of(h, rows, blocks).scores(blocks)
+    return np.array(rows)
 
 
 # scores --------------------------------------------------------------------------------------------------------------
+def _scores(data: DriveData, blocks: Blocks, rows: FloatArray, noise: FloatArray | None = None) -> Scores:
+    """Errors of free runs of readings `rows` (fold, channel, row) by fits without each fold, and densities by the noise
+    that these leave on the other blocks, or that the readings `noise` do."""
+    left = _residuals(data, rows)
+    taught = left if noise is None else _residuals(data, noise)
+    fold = blocks.fold[blocks.block_of_frame]
+    nats = np.zeros(len(fold))
+    for k, frames in enumerate(blocks.taught):
+        own = fold == k
+        nats[own] = _log_density(data.only(frames), taught[k][:, frames], left[k][:, own])
+    errors = blocks.stitched(measured_readings(data) - rows)
+    return Scores(
+        blocks.sums(blocks.free_runs(data, errors) ** 2),
+        np.asarray(np.bincount(blocks.block_of_frame, nats, len(blocks.rows)), np.float64),
+    )
+
+
+def _residuals(data: DriveData, rows: FloatArray) -> FloatArray:
+    """Residuals (fold, channel, frame, bin) of readings (fold, channel, row), of all frames."""
+    return np.array([data.measured - data.transform(compared(data, x)) for x in rows])
+
+
 def _run_squares(h: Hypothesis, blocks: Blocks) -> FloatArray:
     """Mean squared errors (channel,) of free runs by a fit to all blocks."""
     h = _without_chance(h)
@@ -330,7 +319,7 @@ def _log_density(taught: DriveData, residual: FloatArray, held_out: FloatArray) 
     """Log densities (frame,) of `held_out` (channel, frame, bin), given the taught frames' `residual`."""
     C, n = taught.channel_count, taught.band_size.astype(float)
     A = band_covariance(taught, residual) * n[:, None, None]
-    A = A + 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(C)
+    A = A + least_noise(A)
     products = held_out[:, None] * held_out[None]
     B = np.moveaxis(np.add.reduceat(products, taught.band_edges[:-1], axis=-1), (0, 1), (-2, -1))
     m = np.diff(taught.band_edges)
@@ -340,117 +329,66 @@ def _log_density(taught: DriveData, residual: FloatArray, held_out: FloatArray) 
 
 
 # the black box --------------------------------------------------------------------------------------------------------
-class Predicted(NamedTuple):
-    """By the fit without each fold: `readings` (fold, channel, row), `coefficients` (fold, channel, frame, bin), and
-    `possible` (draw, channel, block): draws of the squares of free runs of what may be there."""
-
-    readings: FloatArray
-    coefficients: FloatArray
-    possible: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class BlackBox:
-    """Columns beside a hypothesis, each in a set `kind` (column,), and the `readings` (column, channel, row) and
-    `coefficients` (column, channel, frame, bin) that they make."""
-
-    hypothesis: Hypothesis
-    kind: IntArray = field(repr=False)
-    readings: FloatArray = field(repr=False)
-    coefficients: FloatArray = field(repr=False)
-
-    @classmethod
-    def of(cls, h: Hypothesis) -> BlackBox:
-        """The columns that commands, speed, time and the hypothesis's own response make."""
-        signals = _signals(h)
-        places = [(_BODY, _forces(h.data, signals))]
-        if h.data.channel_count == 2:
-            places += [(_ACCEL, _of_accelerometer(signals)), (_SPEED, _of_speed(signals))]
-        each = [(place, kind, x) for place, sets in places for kind, columns in enumerate(sets) for x in columns]
-        shown = np.stack([_shown(h, place, x) for place, _, x in each])
-        coefficients = np.stack([h.data.transform(compared(h.data, x)) for x in shown])
-        return cls(h, np.array([kind for _, kind, _ in each]), shown, coefficients)
-
-    def predict(self, residuals: FloatArray, blocks: Blocks) -> Predicted:
-        """What the columns foretell of each fold's blocks, taught by the `residuals` (fold, channel, frame, bin) of the
-        other blocks alone."""
-        h, X = self.hypothesis, self.coefficients
-        rng = np.random.default_rng(0)
-        normal, uniform = rng.standard_normal((_BOX_DRAWS, len(X))), rng.random(_BOX_DRAWS)
-        runs = blocks.free_runs(h.data, self.readings)
-        alike = [(blocks.taught == pattern[:, None]).all(0) for pattern in np.unique(blocks.taught, axis=1).T]
-        products = [band_products(h.data, X[:, :, frames]) for frames in alike]
-        rows = []
-        possible = np.zeros((_BOX_DRAWS, h.data.channel_count, len(blocks.rows)))
-        for k, frames in enumerate(blocks.taught):
-            own = np.sum([x for x, group in zip(products, alike, strict=True) if frames[group].all()], axis=0)
-            taught = _TaughtProducts.of(h.data.only(frames), own, X[:, :, frames], residuals[k][:, frames])
-            mean, draws = taught.posterior(self.kind, normal, uniform)
-            rows.append(np.tensordot(mean, self.readings, 1))
-            for b in np.flatnonzero(blocks.fold == k):
-                for c in range(runs.shape[1]):
-                    part = runs[:, c, blocks.rows[b]]
-                    possible[:, c, b] = ((draws @ (part @ part.T)) * draws).sum(1)
-        coefficients = [h.data.transform(compared(h.data, x)) for x in rows]
-        return Predicted(np.stack(rows), np.stack(coefficients), possible)
+def black_box(h: Hypothesis, rows: FloatArray, blocks: Blocks) -> tuple[FloatArray, FloatArray]:
+    """What a black box beside `h` foretells of each fold's blocks, taught by what the readings `rows` (fold, channel,
+    row) leave on the other blocks alone: readings (fold, channel, row), and draws (draw, channel, block) of the squares
+    of free runs of what may be there."""
+    residuals = _residuals(h.data, rows)
+    kind, shown = _columns(h)
+    X = np.stack([h.data.transform(compared(h.data, x)) for x in shown])
+    rng = np.random.default_rng(0)
+    normal, uniform = rng.standard_normal((_BOX_DRAWS, len(X))), rng.random(_BOX_DRAWS)
+    runs = blocks.free_runs(h.data, shown)
+    foretold = []
+    possible = np.zeros((_BOX_DRAWS, h.data.channel_count, len(blocks.rows)))
+    for k, frames in enumerate(blocks.taught):
+        taught = h.data.only(frames)
+        products = band_products(taught, np.concatenate([residuals[k][None], X])[:, :, frames])
+        mean, draws = _posterior(products, kind, taught.band_size, normal, uniform)
+        foretold.append(np.tensordot(mean, shown, 1))
+        for b in np.flatnonzero(blocks.fold == k):
+            for c in range(runs.shape[1]):
+                part = runs[:, c, blocks.rows[b]]
+                possible[:, c, b] = ((draws @ (part @ part.T)) * draws).sum(1)
+    return np.stack(foretold), possible
 
 
-class _TaughtProducts(NamedTuple):
-    """Products over taught frames, in each band: of columns (band, channel, channel, column, column), of columns and
-    residual (band, channel, channel, column), of the residual (band, channel, channel)."""
+def _posterior(
+    products: FloatArray, kind: IntArray, counts: IntArray, normal: FloatArray, uniform: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (column,) and draws (draw, column) of the coefficients of columns in sets `kind` (column,).
 
-    data: DriveData
-    columns: FloatArray
-    mixed: FloatArray
-    residual: FloatArray
-
-    @classmethod
-    def of(cls, data: DriveData, columns: FloatArray, X: FloatArray, residual: FloatArray) -> _TaughtProducts:
-        edges = data.band_edges[:-1]
-        mixed = np.einsum("pcfk,dfk->cdpk", X, residual, optimize=True)
-        squares = np.einsum("cfk,dfk->cdk", residual, residual)
-        return cls(
-            data,
-            columns,
-            np.moveaxis(np.add.reduceat(mixed, edges, axis=-1), -1, 0),
-            np.moveaxis(np.add.reduceat(squares, edges, axis=-1), -1, 0),
-        )
-
-    def posterior(self, kind: IntArray, normal: FloatArray, uniform: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean (column,) and draws (draw, column) of the coefficients, from standard normal (draw, column) and uniform
-        (draw,) numbers."""
-        variance = _PRIOR_SD**2
-        mean, pooling = np.zeros(len(kind)), _pooling(self.data.band_size, _POOLED)
-        for _ in range(_ROUNDS):
-            weights = np.linalg.inv(self._noise(mean, pooling))
-            gram, match = np.tensordot(weights, self.columns, 3), np.tensordot(weights, self.mixed, 3)
-            axes, logs, means = [], [], []
-            for last in (_LINEAR, _MAP, _TIME):
-                use = kind <= last
-                values, vectors = np.linalg.eigh(gram[np.ix_(use, use)])
-                own = vectors.T @ match[use]
-                taken = variance[:, None] / (1 + variance[:, None] * np.maximum(values, 0.0))  # posterior variances
-                logs.append(0.5 * (own**2 * taken + np.log(taken / variance[:, None])).sum(1))
-                whole = np.zeros((len(kind), len(values)))
-                whole[use] = vectors
-                axes.append((whole, taken))
-                means.append((own * taken) @ whole.T)
-            log = np.concatenate(logs)
-            chance = np.exp(log - np.logaddexp.reduce(log))
-            mean = chance @ np.concatenate(means)
-        drawn = np.minimum(np.searchsorted(np.cumsum(chance), uniform), len(chance) - 1)
-        draws = np.concatenate(means)[drawn]
-        for i, at in enumerate(drawn):
-            whole, taken = axes[at // len(variance)]
-            draws[i] += whole @ (np.sqrt(taken[at % len(variance)]) * normal[i, : whole.shape[1]])
-        return mean, draws
-
-    def _noise(self, mean: FloatArray, pooling: FloatArray) -> FloatArray:
-        """Covariance (band, channel, channel) of what coefficients (column,) leave, pooled over bands."""
-        mixed = self.mixed @ mean
-        S = self.residual - mixed - mixed.transpose(0, 2, 1) + (self.columns @ mean) @ mean
-        S = np.tensordot(pooling, S, 1)
-        return S + _LEAST * np.trace(S, axis1=1, axis2=2)[:, None, None] * np.eye(S.shape[1])
+    `products` (band, channel, channel, signal, signal) over taught frames: of the residual, and then of the columns;
+    `counts` (band,) of coefficients a channel; draws are made of standard normal (draw, column) and uniform (draw,)
+    numbers.
+    """
+    variance = _PRIOR_SD**2
+    mean, pooling = np.zeros(len(kind)), _pooling(counts, _POOLED)
+    for _ in range(_ROUNDS):
+        left = np.append(1.0, -mean)
+        noise = np.tensordot(pooling, (products @ left) @ left, 1)
+        weighted = gram(noise + least_noise(noise), products)
+        match, columns = weighted[1:, 0], weighted[1:, 1:]
+        axes, logs, means = [], [], []
+        for last in (_LINEAR, _MAP, _TIME):
+            use = kind <= last
+            values, vectors = np.linalg.eigh(columns[np.ix_(use, use)])
+            own = vectors.T @ match[use]
+            taken = variance[:, None] / (1 + variance[:, None] * np.maximum(values, 0.0))  # posterior variances
+            logs.append(0.5 * (own**2 * taken + np.log(taken / variance[:, None])).sum(1))
+            whole = np.zeros((len(kind), len(values)))
+            whole[use] = vectors
+            axes.append((whole, taken))
+            means.append((own * taken) @ whole.T)
+        log = np.concatenate(logs)
+        chance = np.exp(log - np.logaddexp.reduce(log))
+        mean = chance @ np.concatenate(means)
+    drawn = np.minimum(np.searchsorted(np.cumsum(chance), uniform), len(chance) - 1)
+    draws = np.concatenate(means)[drawn]
+    for i, at in enumerate(drawn):
+        whole, taken = axes[at // len(variance)]
+        draws[i] += whole @ (np.sqrt(taken[at % len(variance)]) * normal[i, : whole.shape[1]])
+    return mean, draws
 
 
 def _pooling(counts: IntArray, least: int) -> FloatArray:
@@ -462,32 +400,14 @@ def _pooling(counts: IntArray, least: int) -> FloatArray:
     return out
 
 
-# what is shown -------------------------------------------------------------------------------------------------------
-def _shown(h: Hypothesis, place: int, x: FloatArray) -> FloatArray:
-    """Readings (channel, row) that a force (row,) [m/s²], or an error of the accelerometer or of the speed, makes."""
-    if place != _BODY:
-        out = np.zeros((2, len(x)))
-        out[0 if place == _ACCEL else 1] = x
-        return out
-    acts = x[h.data.grid.row]
-    return readings(h, acts, speed_gained(h.data.grid, acts))
+def _columns(h: Hypothesis) -> tuple[IntArray, FloatArray]:
+    """The set of each column (column,), and the readings (column, channel, row) that it makes: as a force on the body,
+    an error of the accelerometer, or one of the speed.
 
-
-# columns -------------------------------------------------------------------------------------------------------------
-class _Signals(NamedTuple):
-    """Of rows, in units of their spread: command (in that of `a`), the body's acceleration and its slopes, the speed
-    (centred); time runs from -1 to 1."""
-
-    u: FloatArray
-    a: FloatArray
-    jerk: FloatArray
-    snap: FloatArray
-    v: FloatArray
-    t: FloatArray
-
-
-def _signals(h: Hypothesis) -> _Signals:
-    data = h.data
+    They are of the command (in units of the acceleration), the body's acceleration and its slopes, the speed (centred),
+    all over their spreads, and of the time from -1 to 1.
+    """
+    data, lp = h.data, h.data.low_pass
     gained = h.on_grid()[1][np.searchsorted(data.grid.row, np.arange(len(data.time)))]
 
     def back(x: FloatArray) -> FloatArray:
@@ -497,41 +417,49 @@ def _signals(h: Hypothesis) -> _Signals:
         return out
 
     a = back(gained)
-    jerk = data.low_pass(back(a), 0.1)
-    snap = data.low_pass(back(jerk), 0.1)
+    jerk = lp(back(a), 0.1)
+    snap = lp(back(jerk), 0.1)
     u = np.where(data.starts, data.command, np.roll(data.command, 1))
-    v = data.low_pass(data.smooth_speed, _SMOOTH_S)
+    v = lp(data.smooth_speed, _SMOOTH_S)
     t = 2 * (data.time - data.time.mean()) / max(float(np.ptp(data.time)), 1e-9)
     spread = max(float(a.std()), 1e-3)
-    return _Signals(u / spread, a / spread, _unit(jerk), _unit(snap), (v - v.mean()) / max(float(v.std()), 0.1), t)
+    u, a, v = u / spread, a / spread, (v - v.mean()) / max(float(v.std()), 0.1)
+    jerk, snap = (x / max(float(x.std()), 1e-9) for x in (jerk, snap))
+    one = np.ones_like(a)
 
-
-def _unit(x: FloatArray) -> FloatArray:
-    return x / max(float(x.std()), 1e-9)
-
-
-Sets = tuple[list[FloatArray], list[FloatArray], list[FloatArray]]
-"""Columns (row,) in sets: linear in command and response, maps, and what changes with time."""
-
-
-def _forces(data: DriveData, signals: _Signals) -> Sets:
-    u, a, jerk, snap, v, t = signals
-    lp = data.low_pass
-    linear = [np.ones_like(a), u, a, jerk, snap, *(lp(u, lag) for lag in _LAGS_S)]
     one_sided = [np.minimum(a, 0.0), np.where(a < 0, jerk, 0.0), *(lp(np.minimum(u, 0.0), lag) for lag in (0.2, 0.8))]
     play = [np.tanh(4 * a), np.tanh(jerk), lp(np.tanh(4 * jerk), 0.3)]
-    speed = [*_hats(v, 5), *(a * x for x in _hats(v, 5)), jerk * v]
-    return linear, [*one_sided, *play, *_hats(a, 9), *speed], [t, t**2, a * t, a * t**2, a * t**3]
+    by_speed = [*_hats(v, 5), *(a * x for x in _hats(v, 5)), jerk * v]
+    places = {
+        _BODY: (
+            [one, u, a, jerk, snap, *(lp(u, lag) for lag in _LAGS_S)],
+            [*one_sided, *play, *_hats(a, 9), *by_speed],
+            [t, t**2, a * t, a * t**2, a * t**3],
+        )
+    }
+    if data.channel_count == 2:
+        places[_ACCEL] = (
+            [one, a, jerk, snap],
+            [np.minimum(a, 0.0), *_hats(v, 3), a * v, np.tanh(jerk)],
+            [t, a * t],
+        )
+        places[_SPEED] = [a], [np.minimum(a, 0.0), a * v, *_hats(v, 3)], []
+    kinds, shown = [], []
+    for place, sets in places.items():
+        for kind, columns in enumerate(sets):
+            kinds += [kind] * len(columns)
+            shown += [_shown(h, place, x) for x in columns]
+    return np.array(kinds), np.stack(shown)
 
 
-def _of_accelerometer(signals: _Signals) -> Sets:
-    _, a, jerk, snap, v, t = signals
-    return [np.ones_like(a), a, jerk, snap], [np.minimum(a, 0.0), *_hats(v, 3), a * v, np.tanh(jerk)], [t, a * t]
-
-
-def _of_speed(signals: _Signals) -> Sets:
-    _, a, _, _, v, _ = signals
-    return [a], [np.minimum(a, 0.0), a * v, *_hats(v, 3)], []
+def _shown(h: Hypothesis, place: int, x: FloatArray) -> FloatArray:
+    """Readings (channel, row) that a force (row,) [m/s²], or an error of the accelerometer or of the speed, makes."""
+    if place != _BODY:
+        out = np.zeros((2, len(x)))
+        out[0 if place == _ACCEL else 1] = x
+        return out
+    acts = x[h.data.grid.row]
+    return readings(h, acts, speed_gained(h.data.grid, acts))
 
 
 def _hats(x: FloatArray, count: int) -> list[FloatArray]:

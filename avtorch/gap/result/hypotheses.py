@@ -25,7 +25,7 @@ from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.outliers import rate_onset
 from avtorch.gap.engine.priors import TEMPER
 from avtorch.gap.engine.search import Search
-from avtorch.gap.quantity import Quantity, of_fields, unit_of
+from avtorch.gap.quantity import Quantity, of_fields, unit_behind
 from avtorch.gap.result.attribution import Location
 from avtorch.gap.result.parameters import OwnRandom, ParameterPosterior
 from avtorch.gap.simulator.effect import Effect, candidate_name, delay_effect
@@ -153,9 +153,8 @@ def implausible(
         low, high = p.physical
         if q is None or (q.q95 >= low and q.q05 <= high):
             continue
-        unit = unit_of(p.name).replace("-", "")
         end = "; the effect stands in for something else." if "." in name else "."
-        size = f"{name} is {f'{q.mean:.2g} {unit}'.strip()}, typical {p.low:.2g} to {p.high:.2g}"
+        size = f"{name} is {q.mean:.2g}{unit_behind(p.name)}, typical {p.low:.2g} to {p.high:.2g}"
         out.append(f"{size}: possible are {low:.2g} to {high:.2g}{end}")
     return tuple(out)
 

@@ -98,9 +98,8 @@ def manoeuvres(traces: Traces, *, most: int = 6, named: bool = True) -> tuple[Ma
         change = float(traces.command[last] - traces.command[first])
         part = {name: values[rows] for name, values in lines.items()}
         responses = {name: _response(part["command"], values, change, step) for name, values in part.items()}
-        log = int((np.diff(traces.time[: first + 1]) < 0).sum())
         begin, end = float(traces.time[first]), float(traces.time[last])
-        out.append(Manoeuvre(kind, log, rows, begin, end, change, share, part, responses))
+        out.append(Manoeuvre(kind, int(traces.log[first]), rows, begin, end, change, share, part, responses))
     return tuple(out)
 
 

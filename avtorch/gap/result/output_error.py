@@ -115,18 +115,16 @@ class Runs:
         """The run of each error (error,)."""
         return np.repeat(np.arange(len(self.first)), (self.end - self.counts - 1) // self.rows.between)
 
-    def drive(
-        self, named: FloatArray, lag: float, at: Coefficients, *, slopes: bool = False
-    ) -> tuple[FloatArray, FloatArray]:
-        """Errors (error,) [m/s] of all runs and, with `slopes`, their derivatives (error, coefficient). `named` (row,)
-        [m/s²]: what the car does without free forms, mean over the step."""
+    def drive(self, named: FloatArray, lag: float, at: Coefficients) -> tuple[FloatArray, FloatArray]:
+        """Errors (error,) [m/s] of all runs and their derivatives (error, coefficient). `named` (row,) [m/s²]: what the
+        car does without free forms, mean over the step."""
         rows = self.rows
         return _drive(
             *(self.first, self.end, self.counts, rows.between, rows.dt, lag),
             *(named, rows.command, rows.speed, rows.starts),
             *(rows.knots_u, rows.knots_v, np.ascontiguousarray(at.table), at.curve, at.gain),
             rows.command if rows.feed is None else rows.feed,
-            *(-1.0 if rows.loop_s is None else rows.loop_s / rows.dt, len(self.of_run), slopes),
+            *(-1.0 if rows.loop_s is None else rows.loop_s / rows.dt, len(self.of_run)),
         )
 
 
@@ -165,11 +163,10 @@ def _drive(  # pragma: no cover - compiled
     feed: FloatArray,
     late: float,
     errors: int,
-    slopes: bool,
 ) -> tuple[FloatArray, FloatArray]:
     nv, nodes = len(knots_v), len(knots_u) * len(knots_v)
     size = nodes + nv + 1
-    err, J = np.empty(errors), np.empty((errors if slopes else 1, size))
+    err, J = np.empty(errors), np.empty((errors, size))
     keep = np.exp(-dt / lag)
     begun = np.zeros((len(first), size))  # what is in the lag where a run begins
     begun_x = np.zeros(len(first))
@@ -200,7 +197,7 @@ def _drive(  # pragma: no cover - compiled
     off, by_off = np.zeros(1), np.zeros((1, 1))  # how much faster a run of a loop is than what was measured
     if late >= 0.0:
         longest = 1 + (end - first).max()
-        off, by_off = np.zeros(longest), np.zeros((longest, size if slopes else 1))
+        off, by_off = np.zeros(longest), np.zeros((longest, size))
     for r in range(len(first)):
         v, x, since = float(speed[first[r]]), float(begun_x[r]), 0
         dx[:] = begun[r]
@@ -208,18 +205,16 @@ def _drive(  # pragma: no cover - compiled
         for i in range(first[r], end[r] - 1):
             u = command[i]
             if late >= 0.0:
-                off[i - first[r]] = v - speed[i]
-                if slopes:
-                    by_off[i - first[r]] = dv
-                    du[:] = 0.0
                 now = i - first[r]
+                off[now], by_off[now] = v - speed[i], dv
+                du[:] = 0.0
                 # what is not yet known goes on as by the last step
                 near, more = (now - whole, 1.0 - part) if whole >= 0 else (now, 2.0 - part)
                 for k, share in ((near, more), (near - 1, 1.0 - more)):
                     if k >= 0:
                         u -= share * off[k]
-                        if slopes:
-                            du -= share * by_off[k]
+                        for j in range(size):
+                            du[j] -= share * by_off[k, j]
             a, p, by_u = _below(u, knots_u)
             b, q, by = _below(v, knots_v)
             n = a * nv + b
@@ -228,28 +223,28 @@ def _drive(  # pragma: no cover - compiled
             F = low + q * (high - low) + gain * feed[i]
             after = keep * x + (1 - keep) * F
             R = curve[b] + q * (curve[b + 1] - curve[b])
-            if slopes:
-                # the lagged force gains F dt - lag (after - x)
-                kept, new = lag * (1 - keep), dt - lag * (1 - keep)
-                bend = new * (high - low) * by
-                fall = dt * (curve[b + 1] - curve[b]) * by
-                force = (1 - keep) * (high - low) * by
+            # the lagged force gains F dt - lag (after - x)
+            kept, new = lag * (1 - keep), dt - lag * (1 - keep)
+            bend = new * (high - low) * by
+            fall = dt * (curve[b + 1] - curve[b]) * by
+            force = (1 - keep) * (high - low) * by
+            for j in range(size):
+                d = dv[j]
+                dv[j] = d * (1.0 + bend + fall) + kept * dx[j]
+                dx[j] = keep * dx[j] + force * d
+            if late >= 0.0:
+                left = (1 - q) * table[a, b] + q * table[a, b + 1]
+                steep = by_u * ((1 - q) * table[a + 1, b] + q * table[a + 1, b + 1] - left)
                 for j in range(size):
-                    d = dv[j]
-                    dv[j] = d * (1.0 + bend + fall) + kept * dx[j]
-                    dx[j] = keep * dx[j] + force * d
-                if late >= 0.0:
-                    left = (1 - q) * table[a, b] + q * table[a, b + 1]
-                    steep = by_u * ((1 - q) * table[a + 1, b] + q * table[a + 1, b + 1] - left)
-                    dv += new * steep * du
-                    dx += (1 - keep) * steep * du
-                for j, w in ((n, (1 - p) * (1 - q)), (n + 1, (1 - p) * q), (n + nv, p * (1 - q)), (n + nv + 1, p * q)):
-                    dv[j] += new * w
-                    dx[j] += (1 - keep) * w
-                dv[size - 1] += new * feed[i]
-                dx[size - 1] += (1 - keep) * feed[i]
-                dv[nodes + b] += dt * (1 - q)
-                dv[nodes + b + 1] += dt * q
+                    dv[j] += new * steep * du[j]
+                    dx[j] += (1 - keep) * steep * du[j]
+            for j, w in ((n, (1 - p) * (1 - q)), (n + 1, (1 - p) * q), (n + nv, p * (1 - q)), (n + nv + 1, p * q)):
+                dv[j] += new * w
+                dx[j] += (1 - keep) * w
+            dv[size - 1] += new * feed[i]
+            dx[size - 1] += (1 - keep) * feed[i]
+            dv[nodes + b] += dt * (1 - q)
+            dv[nodes + b + 1] += dt * q
             v += dt * (named[i] + R) + F * dt - lag * (after - x)
             x = after
             if v < 0.0:
@@ -259,8 +254,6 @@ def _drive(  # pragma: no cover - compiled
             since += i >= counts[r]
             if since == record:
                 since = 0
-                err[row] = v - speed[i + 1]
-                if slopes:
-                    J[row] = dv
+                err[row], J[row] = v - speed[i + 1], dv
                 row += 1
     return err, J

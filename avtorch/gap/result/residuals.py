@@ -8,7 +8,6 @@ identification (Ljung, System Identification, 2nd ed., 1999, Sec. 16.6).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -28,98 +27,80 @@ _Z99 = 2.5758293035489004
 _OVERLAPPED = 1.89  # degrees of freedom per segment: Hann windows that overlap by half (Welch, 1967)
 
 
-@dataclass(frozen=True)
-class Residuals:
-    """Residuals (row,) [m/s²] of the simulator `before` and `after` the repair: measured less simulated.
+def residuals(traces: Traces) -> tuple[FloatArray, FloatArray]:
+    """Residuals (row,) [m/s²] of the simulator before and after the repair: measured less simulated.
 
     Of the acceleration where it was measured; else of the speed's slope over 1 s, as a rollout's speed itself drifts.
-    `time` [s] from the log's start, `command` [m/s²] and `speed` [m/s], None where it was not measured, all (row,);
-    `stretch` (row,) numbers stretches without gaps and `step` is the time between their rows [s].
-
     """
+    measured, before, after = traces.accelerations(_SLOPE_S)
+    return measured - before, measured - after
 
-    channel: str
-    step: float
-    time: FloatArray = field(repr=False)
-    stretch: IntArray = field(repr=False)
-    command: FloatArray = field(repr=False)
-    speed: FloatArray | None = field(repr=False)
-    before: FloatArray = field(repr=False)
-    after: FloatArray = field(repr=False)
 
-    @classmethod
-    def of(cls, traces: Traces) -> Residuals:
-        """The residuals of a diagnosis' traces."""
-        measured, *simulated = traces.accelerations(_SLOPE_S)
-        both = (measured - x for x in simulated)
-        rows = (traces.time, traces.stretch, traces.command, traces.speed)
-        channel = "accel" if "accel" in traces.channels else "speed"
-        return cls(channel, traces.step, *rows, *both)
+def binned_means(traces: Traces, axis: FloatArray, residual: FloatArray, *, bins: int = 9) -> BinnedMeans:
+    """Means of `residual` (row,) in bins of `axis` (row,) that hold as many rows each."""
+    edges = np.unique(np.quantile(axis, np.linspace(0, 1, bins + 1)))
+    number = np.searchsorted(edges[1:-1], axis, side="right")
+    block = _blocks(traces)
+    many = max(int(number.max(initial=0)) + 1, 1)
+    counts, sums, along = (np.zeros((int(block.max(initial=0)) + 1, many)) for _ in range(3))
+    for array, values in ((counts, np.ones_like(axis)), (sums, residual), (along, axis)):
+        np.add.at(array, (block, number), values)
+    total = counts.sum(0)
+    mean = sums.sum(0) / total
+    blocks = (counts > 0).sum(0)
+    # a ratio of sums over blocks, whose errors are those of independent blocks
+    spread = np.sqrt(((sums - mean * counts) ** 2).sum(0) * blocks / np.maximum(blocks - 1, 1)) / total
+    half = np.where(blocks >= _LEAST_BLOCKS, stdtrit(np.maximum(blocks - 1, 1), 0.95) * spread, np.nan)
+    return BinnedMeans(along.sum(0) / total, mean, mean - half, mean + half)
 
-    def against(self, axis: FloatArray, residual: FloatArray, *, bins: int = 9) -> BinnedMeans:
-        """Means of `residual` (row,) in bins of `axis` (row,) that hold as many rows each."""
-        edges = np.unique(np.quantile(axis, np.linspace(0, 1, bins + 1)))
-        number = np.searchsorted(edges[1:-1], axis, side="right")
-        block = self._blocks()
-        many = max(int(number.max(initial=0)) + 1, 1)
-        counts, sums, along = (np.zeros((int(block.max(initial=0)) + 1, many)) for _ in range(3))
-        for array, values in ((counts, np.ones_like(axis)), (sums, residual), (along, axis)):
-            np.add.at(array, (block, number), values)
-        total = counts.sum(0)
-        mean = sums.sum(0) / total
-        blocks = (counts > 0).sum(0)
-        # a ratio of sums over blocks, whose errors are those of independent blocks
-        spread = np.sqrt(((sums - mean * counts) ** 2).sum(0) * blocks / np.maximum(blocks - 1, 1)) / total
-        half = np.where(blocks >= _LEAST_BLOCKS, stdtrit(np.maximum(blocks - 1, 1), 0.95) * spread, np.nan)
-        return BinnedMeans(along.sum(0) / total, mean, mean - half, mean + half)
 
-    def spectrum(self, residual: FloatArray) -> Spectrum | None:
-        """Power of `residual` (row,) over frequency; None where no stretch is long enough."""
-        size = max(8, round(_SEGMENT_S / self.step))
-        count, total, frequency = 0, np.zeros(size // 2 + 1), np.zeros(0)
-        for rows in self._stretches():
-            if parts := (len(rows) - size) // (size // 2) + 1 if len(rows) >= size else 0:
-                frequency, power = welch(residual[rows], 1 / self.step, nperseg=size, noverlap=size - size // 2)
-                count, total = count + parts, total + parts * power
-        if not count:
-            return None
-        mean = total[1:] / count
-        freedom = max(2.0, _OVERLAPPED * count)
-        low, high = (freedom / chdtri(freedom, p) for p in (0.05, 0.95))
-        return Spectrum(frequency[1:], mean, mean * low, mean * high)
+def spectrum(traces: Traces, residual: FloatArray) -> Spectrum | None:
+    """Power of `residual` (row,) over frequency; None where no stretch is long enough."""
+    size = max(8, round(_SEGMENT_S / traces.step))
+    count, total, frequency = 0, np.zeros(size // 2 + 1), np.zeros(0)
+    for rows in traces.stretches:
+        if parts := (len(rows) - size) // (size // 2) + 1 if len(rows) >= size else 0:
+            frequency, power = welch(residual[rows], 1 / traces.step, nperseg=size, noverlap=size - size // 2)
+            count, total = count + parts, total + parts * power
+    if not count:
+        return None
+    mean = total[1:] / count
+    freedom = max(2.0, _OVERLAPPED * count)
+    low, high = (freedom / chdtri(freedom, p) for p in (0.05, 0.95))
+    return Spectrum(frequency[1:], mean, mean * low, mean * high)
 
-    def correlation(self, residual: FloatArray, *, seconds: float = 5.0) -> Correlation:
-        """Of `residual` (row,) with the command a lag earlier, from -1 s (a later command) to `seconds`."""
-        first, last = -round(1.0 / self.step), round(seconds / self.step)
-        parts = self._stretches()
-        u, e = self.command - self.command.mean(), residual - residual.mean()
-        scale = np.sqrt((u**2).sum() * (e**2).sum()) or 1.0
-        both = _products(u, e, parts, first, last) / scale
-        reach = min(round(_COLOUR_S / self.step), max(map(len, parts), default=1) - 1)
-        own = [_products(x, x, parts, 0, reach) / ((x**2).sum() or 1.0) for x in (u, e)]
-        together = own[0] * own[1]
-        # independent coloured signals vary like fewer white rows
-        variance = max(float(together[0] + 2 * together[1:].sum()), 1.0) / len(e)
-        return Correlation(
-            np.linspace(first * self.step, last * self.step, last - first + 1), both, _Z99 * variance**0.5
-        )
 
-    def usual(self, residual: FloatArray) -> float:
-        """Within ± this [m/s²] would lie 99 % of a steady normal `residual` (row,) with these quartiles."""
-        low, high = np.quantile(residual, (0.25, 0.75))
-        return float(_Z99 * (high - low) / (2 * 0.6744897501960817))
+def correlation(traces: Traces, residual: FloatArray, *, seconds: float = 5.0) -> Correlation:
+    """Of `residual` (row,) with the command a lag earlier, from -1 s (a later command) to `seconds`."""
+    first, last = -round(1.0 / traces.step), round(seconds / traces.step)
+    parts = traces.stretches
+    u, e = traces.command - traces.command.mean(), residual - residual.mean()
+    scale = np.sqrt((u**2).sum() * (e**2).sum()) or 1.0
+    both = _products(u, e, parts, first, last) / scale
+    reach = min(round(_COLOUR_S / traces.step), max(map(len, parts), default=1) - 1)
+    own = [_products(x, x, parts, 0, reach) / ((x**2).sum() or 1.0) for x in (u, e)]
+    together = own[0] * own[1]
+    # independent coloured signals vary like fewer white rows
+    variance = max(float(together[0] + 2 * together[1:].sum()), 1.0) / len(e)
+    return Correlation(
+        np.linspace(first * traces.step, last * traces.step, last - first + 1), both, _Z99 * variance**0.5
+    )
 
-    def _stretches(self) -> list[IntArray]:
-        return np.split(np.arange(len(self.time)), np.flatnonzero(np.diff(self.stretch)) + 1)
 
-    def _blocks(self) -> IntArray:
-        """The number of each row's block."""
-        size = max(1, round(BLOCK_S / self.step))
-        numbers, first = [], 0
-        for rows in self._stretches():
-            numbers.append(first + np.arange(len(rows)) // size)
-            first = int(numbers[-1][-1]) + 1 if len(rows) else first
-        return np.concatenate(numbers)
+def usual(residual: FloatArray) -> float:
+    """Within ± this [m/s²] would lie 99 % of a steady normal `residual` (row,) with these quartiles."""
+    low, high = np.quantile(residual, (0.25, 0.75))
+    return float(_Z99 * (high - low) / (2 * 0.6744897501960817))
+
+
+def _blocks(traces: Traces) -> IntArray:
+    """The number of each row's block."""
+    size = max(1, round(BLOCK_S / traces.step))
+    numbers, first = [], 0
+    for rows in traces.stretches:
+        numbers.append(first + np.arange(len(rows)) // size)
+        first = int(numbers[-1][-1]) + 1 if len(rows) else first
+    return np.concatenate(numbers)
 
 
 def _products(u: FloatArray, e: FloatArray, parts: list[IntArray], least: int, most: int) -> FloatArray:

@@ -37,7 +37,7 @@ def _verdict(found: Findings) -> str:
         chance = found.winner.probability
         first = "The" if chance >= SURE else f"No effect stands out: {'probably' if chance >= 0.5 else 'perhaps'} the"
         return f"{first} simulator lacks nothing that this log shows ({p}){but}."
-    if found.budget is not None and (len(verdict.names) > 1 or verdict.partial):
+    if found.budget is not None and found.budget.parts and (len(verdict.names) > 1 or verdict.partial):
         return str(found.budget)
     if found.tested is not None and not found.tested.missing:
         own = [x for x in found.tested.wrong if x.own or "." in x.name]
@@ -105,9 +105,8 @@ def budget(found: Findings) -> list[str]:
     cut = f"this effect {verb}s" if len(found.budget.names) == 1 else f"these effects {verb}"
     if found.free_form is not None:
         cut = f"the repaired simulator {verb}s"
-    told = found.budget.names == found.verdict.names and not found.verdict.partial
-    line = [found.budget.beside_its_name() if told else str(found.budget)]
-    line = [] if headline(found).endswith(str(found.budget)) else line
+    told = len(found.budget.names) == 1 and found.budget.names == found.verdict.names and not found.verdict.partial
+    line = [] if headline(found).endswith(str(found.budget)) else [found.budget.said(told=told)]
     rest = found.budget.unexplained.rest(found.budget.material)
     errors, floors = [], []
     for name, error in found.budget.by_channel.items():
@@ -228,8 +227,6 @@ def gap(found: Findings) -> list[str]:
     parts = []
     if gap.rollout_rmse_accel is not None:
         floor = "" if gap.rollout_floor_accel is None else f" ({gap.rollout_floor_accel:.2g} with the best hypothesis)"
-        if gap.rollout_floor_accel is not None and gap.rollout_floor_accel > 0.97 * gap.rollout_rmse_accel:
-            floor = " (no smaller with the best hypothesis)"
         parts.append(f"acceleration error {gap.rollout_rmse_accel:.2g} m/s²{floor}")
     if gap.rollout_rmse_speed is not None:
         parts.append(f"speed error {gap.rollout_rmse_speed:.2g} m/s")

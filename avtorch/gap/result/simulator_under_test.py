@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from avtorch.gap.quantity import Quantity, of_fields, unit_of, words_of
+from avtorch.gap.quantity import Quantity, of_fields, unit_behind, words_of
 from avtorch.gap.simulator.plant import GapPlant
 
 SAME_KIND = 0.1
@@ -34,7 +34,7 @@ class ParameterDifference:
 
     def __str__(self) -> str:
         effect, _, key = ("", "", self.name) if self.own else self.name.rpartition(".")
-        unit = "" if self.own else f" {unit_of(key)}".replace(" -", "")
+        unit = "" if self.own else unit_behind(key)
         words = f"{effect}: {words_of(key)}" if effect else key
         shown = _short if effect or self.own else "{:.2f}".format
         own, mean, low, high = map(shown, (self.simulator, self.car.mean, self.car.q05, self.car.q95))

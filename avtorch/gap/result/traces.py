@@ -81,6 +81,11 @@ class Traces:
         return np.split(np.arange(len(self.time)), np.flatnonzero(np.diff(self.stretch)) + 1)
 
     @property
+    def log(self) -> IntArray:
+        """Number (row,) of the log of each row, from 0."""
+        return np.cumsum(np.diff(self.time, prepend=self.time[:1]) < 0, dtype=np.int64)
+
+    @property
     def speed(self) -> FloatArray | None:
         """Measured speed, (row,); None where it was not measured."""
         return self.measured[self.channels.index("speed")] if "speed" in self.channels else None

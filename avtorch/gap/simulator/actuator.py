@@ -145,8 +145,8 @@ class Actuator:
                 alpha, m1, m2 = motion_coefficients(T, h)
                 d = state.accel - g
                 return ActuatorState(g + alpha * d), h * g + m1 * d, 0.5 * h * h * g + m2 * d
-            accel, _, speed = _limited(state.accel, part, jerk)
-            return ActuatorState(accel), speed, _limited_place(state.accel, part, jerk)
+            accel, _, speed, place = _limited(state.accel, part, jerk)
+            return ActuatorState(accel), speed, place
         assert state.swing is not None
         slewed = state.target
         if jerk is not None:
@@ -165,30 +165,19 @@ def _joined(first: Tensor, later: Tensor) -> Tensor:
     return torch.cat([first.expand(later.shape[:-1])[..., None], later], -1)
 
 
-def _limited(a: Tensor, part: Substep, jerk: Limits) -> tuple[Tensor, Tensor, Tensor]:
-    """Rate-limited part from `a`: acceleration after it, its derivative by `a`, change of speed."""
-    g, T = part.target, part.lag
-    at_limit, cut = _at_limit(a, part, jerk)
-    rest, left = part.length - at_limit, g - a - cut
-    lost = torch.expm1(-rest / T)
-    after = g - left * (1 + lost)
-    return after, 1 + lost, (a + 0.5 * cut) * at_limit + rest * g + T * lost * left
-
-
-def _limited_place(a: Tensor, part: Substep, jerk: Limits) -> Tensor:
-    """Change of the position over that part, besides `speed length`."""
-    at_limit, cut = _at_limit(a, part, jerk)
-    rest, left = part.length - at_limit, part.target - a - cut
-    place = at_limit * at_limit * (0.5 * a + cut / 6) + (a + 0.5 * cut) * at_limit * rest
-    return place + 0.5 * rest * rest * part.target - motion_coefficients(part.lag, rest)[2] * left
-
-
-def _at_limit(a: Tensor, part: Substep, jerk: Limits) -> tuple[Tensor, Tensor]:
-    """Time at the limit, before the exponential part, and the change of the acceleration in it."""
+def _limited(a: Tensor, part: Substep, jerk: Limits) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Rate-limited part from `a`: acceleration after it, its derivative by `a`, change of the speed, and change of the
+    position besides `speed length`."""
     d = part.target - a
     J = _limit(d, jerk)
-    at_limit = torch.minimum((d.abs() / J - part.lag).clamp_min(0.0), part.length)
-    return at_limit, torch.sign(d) * J * at_limit
+    at_limit = torch.minimum((d.abs() / J - part.lag).clamp_min(0.0), part.length)  # before the exponential part
+    cut = torch.sign(d) * J * at_limit
+    rest, left = part.length - at_limit, d - cut
+    lost, mean = torch.expm1(-rest / part.lag), a + 0.5 * cut
+    place = at_limit * at_limit * (0.5 * a + cut / 6) + mean * at_limit * rest
+    place = place + 0.5 * rest * rest * part.target - motion_coefficients(part.lag, rest)[2] * left
+    speed = mean * at_limit + rest * part.target + part.lag * lost * left
+    return part.target - left * (1 + lost), 1 + lost, speed, place
 
 
 def _limit(d: Tensor, jerk: Limits) -> Tensor:

@@ -377,12 +377,12 @@ def cause_words(name: str, values: Mapping[str, float]) -> str:
         ('the command acts after a delay', '')
     """
     kind = EFFECTS.get(name)
-    if kind is None or (not kind.words and kind.in_words.__func__ is Effect.in_words.__func__):
+    if kind is None:
         return ""
-    needed = [p.name for p in (kind.derived or kind.parameters) if p.reported]
-    if any(math.isnan(values.get(key, math.nan)) for key in needed):
+    try:
+        return kind.in_words({key: x for key, x in values.items() if not math.isnan(x)})
+    except KeyError:  # a value that the words need is not known
         return kind.meaning
-    return kind.in_words(values)
 
 
 def named_cause(name: str, values: Mapping[str, float], behind: str = "") -> str:

@@ -8,6 +8,7 @@ needs no Jacobian and every coordinate of a fit has scale one. The typical range
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -19,6 +20,13 @@ from torch import Tensor
 from avtorch.errors import InputError, printable
 
 Constraint = Literal["real", "positive", "negative", "unit"]
+_LINKS: dict[Constraint, tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]] = {
+    "real": (lambda x: x, lambda x: x),
+    "positive": (torch.log, torch.exp),
+    "negative": (lambda x: torch.log(-x), lambda x: -torch.exp(x)),
+    "unit": (torch.logit, torch.sigmoid),
+}
+"""From a value to the scale of its prior, and back."""
 
 _CENTRAL_80 = 1.2815515655446004  # normal quantile of 0.9
 _AS_FAR = 3.0  # multiple of the typical range, where an effect does not state what is possible
@@ -88,32 +96,17 @@ class Parameter:
     @cached_property
     def _ends(self) -> tuple[float, float]:
         """`low` and `high` on the link's scale."""
-        low, high = (float(self._link(torch.tensor(x, dtype=torch.float64))) for x in (self.low, self.high))
+        link = _LINKS[self.constraint][0]
+        low, high = (float(link(torch.tensor(x, dtype=torch.float64))) for x in (self.low, self.high))
         return low, high
-
-    def _link(self, value: Tensor) -> Tensor:
-        if self.constraint == "positive":
-            return value.log()
-        if self.constraint == "negative":
-            return (-value).log()
-        if self.constraint == "unit":
-            return torch.logit(value)
-        return value
 
     def constrain(self, z: Tensor) -> Tensor:
         """The value for `z`, elementwise."""
-        x = self.location + self.spread * z
-        if self.constraint == "positive":
-            return x.exp()
-        if self.constraint == "negative":
-            return -x.exp()
-        if self.constraint == "unit":
-            return torch.sigmoid(x)
-        return x
+        return _LINKS[self.constraint][1](self.location + self.spread * z)
 
     def unconstrain(self, value: Tensor) -> Tensor:
         """`z` for a value, elementwise; infinite for a neutral value at the edge of the constraint."""
-        return (self._link(value) - self.location) / self.spread
+        return (_LINKS[self.constraint][0](value) - self.location) / self.spread
 
     def typical(self) -> Tensor:
         """The prior's median."""

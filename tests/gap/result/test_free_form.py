@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,8 +13,9 @@ from avtorch.gap import ConstantResistance, ForceTable, GapPlant, Gust, Resistan
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.recorder import base_fit
+from avtorch.gap.result import held_out
 from avtorch.gap.result.free_form import FittedForm, Sizes, fitted_form
-from avtorch.gap.result.held_out import HeldOut, Scores
+from avtorch.gap.result.held_out import Scores
 from avtorch.gap.result.output_error import Coefficients, Rows, Runs
 from avtorch.io import Log
 from tests.gap.cars import log_of
@@ -37,7 +37,7 @@ def test_a_car_with_a_map_is_foretold_better_with_one() -> None:
     form = found(True)
     assert form.earns_its_place(named=False)
     assert form.score < -1.0
-    car = form.form.beside(plant([], T_L=0.3))
+    car = form.beside(plant([], T_L=0.3))
     assert GapPlant.from_toml(car.to_toml()).to_toml() == car.to_toml()
     assert 0.1 < float(car.T_L) < 0.6
 
@@ -62,7 +62,7 @@ def test_slopes_of_free_runs_are_their_derivatives() -> None:
     knots = (np.array([-1.0, 0.0, 1.0]), np.array([8.0, 10.0, 12.0]))
     runs, named = Runs.of(Rows(0.1, command, speed, np.arange(n), starts, *knots), None, 10.0, 1.5), 0.1 * command
     x = 0.3 * rng.normal(size=13)
-    _, slopes = runs.drive(named, 0.3, Coefficients.of(x, (3, 3)), slopes=True)
+    _, slopes = runs.drive(named, 0.3, Coefficients.of(x, (3, 3)))
     for k in range(len(x)):
         ends = []
         for sign in (-1, 1):
@@ -83,16 +83,14 @@ def test_a_table_costs_more_without_a_resistance() -> None:
 def test_a_free_form_that_loses_in_the_budgets_runs_is_not_handed_back(named: float, free: float, gains: bool) -> None:
     """Against names alone, and against the baseline; channels count alike, whatever their units."""
     scale = np.array([[4.0, 4.0], [0.01, 0.03]])  # (channel, block)
-    steps = tuple(Scores(x * scale, np.zeros(2)) for x in (1.0, named, free))
-    held = HeldOut((), cast(Any, None), steps, steps[1], steps[0], np.zeros(1), horizon_s=10.0, free=True)
-    assert held.free_gains(named=True) == gains
-    assert [x.squares[0, 0] for x in held.without_free().steps] == [4.0, 4.0 * named]
-    assert not held.without_free().free
+    base, names, carried = (Scores(x * scale, np.zeros(2)) for x in (1.0, named, free))
+    assert held_out.gains(carried, base, names) == gains
+    assert held_out.gains(carried, base, None) == (free < 1.0)
 
 
 def test_the_gust_beside_a_free_form_is_not_handed_back() -> None:
     """The form takes a part of it; what is left is not known."""
-    back = found(mapped=True).form.beside(plant([Gust(0.3, 5.0), ConstantResistance(0.1)]))
+    back = found(mapped=True).beside(plant([Gust(0.3, 5.0), ConstantResistance(0.1)]))
     assert [e.name for e in back.effects if e.name in ("gust", "constant_resistance")] == ["constant_resistance"]
 
 
@@ -112,7 +110,7 @@ def test_a_gain_of_free_runs_is_handed_back_where_the_evidences_errs(fresh_seed:
     assert form is not None
     assert base["K_L"] < 0.5
     assert form.earns_its_place(named=False)
-    back = form.form.beside(plant([], T_L=base["T_L"], K_L=base["K_L"]))
+    back = form.beside(plant([], T_L=base["T_L"], K_L=base["K_L"]))
     # of the commands that it follows alone, as a gain or a map; what it does not follow is noise of the command, and
     # makes a regression's gain a little small
     drive = SimulatorInput(*map(torch.as_tensor, (time, slow, np.full_like(time, 20.0))))
@@ -130,3 +128,8 @@ def test_a_speed_that_falls_as_the_command_rises_has_no_free_form() -> None:
     log = Log.from_arrays(time=time, accel_cmd=command, accel=accel + 0.05 * rng.normal(size=len(time)), speed=speed)
     base = fit(base_fit(DriveData.of(log)))
     assert fitted_form(base, plant([]), base) is None
+
+
+def test_a_simulator_that_has_a_force_map_gets_no_second_one() -> None:
+    base = found(mapped=False).hypothesis
+    assert fitted_form(base, plant([MAP]), base) is None

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from avtorch.gap import EFFECTS
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.budget import Budget, ChannelError, Part, Unexplained
+from avtorch.gap.result.budget import Budget, ChancePart, ChannelError, Part, Unexplained
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.gap_size import GapSize
 from avtorch.gap.result.hypotheses import Candidate, Verdict, candidate_name
 from avtorch.gap.result.log_facts import LogFacts
+from avtorch.gap.result.sentences import headline
 
 NAMES = (
     "sensor_lag",
@@ -79,3 +81,11 @@ def test_they_are_one_hypothesis_among_the_others(seven: Diagnosis) -> None:
 def test_the_sentence_says_what_each_does(seven: Diagnosis) -> None:
     told = " ".join(str(seven).split())
     assert all(name in told for name in NAMES)
+
+
+def test_causes_by_chance_alone_are_named_by_the_headline(seven: Diagnosis) -> None:
+    assert seven.budget is not None
+    budget = replace(seven.budget, parts=(), chance=(ChancePart("gust", 0.9), ChancePart("outliers", 0.8)))
+    verdict = Verdict(budget.verdict, ("gust+outliers",), abstained=False, why="They predict.")
+    said = headline(replace(seven, budget=budget, verdict=verdict))
+    assert all(name in said for name in ("gust", "outliers"))
