@@ -108,27 +108,6 @@ def test_a_drivers_rows_and_those_at_standstill_are_masked():
     assert not bool(clean.windows[4].window.belief.excited)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("rest", ["cruise", "standstill", "constant"])
-def test_a_window_that_says_nothing_leaves_the_belief(healthy, rest):
-    n, rng = 1000, np.random.default_rng(4)
-    zero = np.zeros(n)
-    speed = np.full(n, 0.0 if rest == "standstill" else 20.0)
-    jerk = 0.1 * rng.standard_normal(n) if rest == "cruise" else zero
-    accel = {"cruise": 0.005 * rng.standard_normal(n), "standstill": zero, "constant": np.full(n, 0.45)}[rest]
-    command = {"cruise": 0.005 * rng.standard_normal(n), "standstill": zero - 0.5, "constant": np.full(n, 0.5)}[rest]
-    extra = {"time": 20.0 + 0.01 * np.arange(n), "accel": accel, "accel_cmd": command, "speed": speed, "jerk": jerk}
-    made = columns(healthy)
-    log = Log.from_arrays(**{name: np.concatenate([made[name], extra[name]]) for name in extra})
-    for mode in ("lambda", "posterior", "forgetting"):
-        windows = estimate(log, mode=mode, settings=QUICK).windows
-        assert [bool(w.window.belief.excited) for w in windows[10:]] == [False] * 5
-        assert bool(windows[2].window.belief.excited)
-        for w in windows[10:]:
-            assert_same_belief(w.window.belief, windows[9].window.belief)
-            assert w.report.names() == []
-
-
 def test_a_gap_restarts_the_grid(healthy):
     keep = (healthy.time < 7.3) | (healthy.time >= 9.55)
     log = Log.from_arrays(**{k: v[keep] for k, v in columns(healthy).items() if k not in ("engaged", "segment")})
@@ -237,14 +216,6 @@ def test_the_latent_form_as_it_is_answered(rotating_seed):
             assert stat["q05"] < stat["mean"] < stat["q95"]
             # the reverse of a 5 sigma interval, in the logarithm as the posterior is skewed
             assert abs(np.log(stat["mean"] / truth)) < BAR * stat["sd"] / stat["mean"]
-
-
-def test_the_jerk_form_as_it_is_answered(healthy):
-    answer = estimates_answer(estimate(healthy, settings=QUICK))
-    assert answer["schema"] == "avtorch.estimates/1"
-    for window in answer["windows"]:
-        assert "noise" not in window
-        assert set(window["sigma"]) == {"mean", "sd", "q05", "q95"}
 
 
 @pytest.mark.slow

@@ -249,21 +249,6 @@ def _text(comparison: Comparison) -> str:
     return " | ".join(cells)
 
 
-@pytest.mark.parametrize(
-    ("effects", "message"),
-    [
-        (["sensor_bais"], "effect: found 'sensor_bais', needs an effect's name; perhaps sensor_bias"),
-        ("sensor_bias", "effects: found 'sensor_bias', needs a list of names or classes"),
-        ([3], "effects: found '3', needs names or classes of effects"),
-        ([Log], "effects: found .*, needs names or classes of effects"),
-    ],
-)
-def test_candidates_that_are_no_effects(effects: Sequence[str], message: str) -> None:
-    log = log_of(seconds=20.0)
-    with pytest.raises(InputError, match=message):
-        avtorch.compare(log, log, effects=effects)
-
-
 def test_a_side_too_short_for_a_cause() -> None:
     long, short = log_of(seconds=60.0), log_of(seconds=16.0)
     for sides, name in (((short, long), "before"), ((long, short), "after")):

@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, JerkStatistics
 from avtorch.inference.priors import (
     Joint,
@@ -131,11 +130,3 @@ def test_same_generator_same_draws_and_windows_do_not_mix(make_windows) -> None:
     louder = replace(w.statistics, jj=w.statistics.jj * torch.tensor([1.0, 4.0], dtype=F64))
     other = sample_conjugate(JerkDensity(louder), draws=500, generator=torch.Generator().manual_seed(7))
     assert other.posterior.mean[1, 2] > 1.5 * first.posterior.mean[1, 2]
-
-
-def test_bad_input_names_itself(make_windows) -> None:
-    density = JerkDensity(make_windows(1, [1.0]).statistics)
-    with pytest.raises(InputError, match="draws: 1"):
-        sample_conjugate(density, draws=1)
-    with pytest.raises(InputError, match="proposals: 0"):
-        sample_conjugate(density, proposals=0)

@@ -70,7 +70,7 @@ def refused(path: Path, *words: str) -> str:
     return said
 
 
-_MOST_SECONDS = 5  # for one content, of some kilobytes; `apart.MOST_SECONDS` is for recordings
+_MOST_SECONDS = 2  # for one content, of some kilobytes; `apart.MOST_SECONDS` is for recordings
 
 
 def survive(path: Path, contents: Sequence[bytes]) -> int:
