@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,3 +27,21 @@ def data_dir() -> Path:
     path = Path(folder)
     assert path.is_dir(), f"AVTORCH_DATA={folder} is not a directory"
     return path
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Recordings and Parquet are read in the test's own process: most of a short test would be the start of another.
+
+    That one is in `io/formats/test_apart.py` and `io/test_log.py`.
+    """
+    from avtorch.io.formats import apart
+    from avtorch.io.formats.apart_process import answered
+
+    def asked(path: Any, kind: Any, wanted: Any) -> tuple[dict[str, Any], memoryview]:
+        reader = importlib.import_module(f"avtorch.io.formats.{kind.reader}")
+        wanted = wanted.pattern if isinstance(wanted, re.Pattern) else wanted if wanted is None else list(wanted)
+        told, content = answered(reader.open_file(path, kind), wanted)
+        return told, memoryview(content)
+
+    monkeypatch.setattr(apart, "_asked", asked)

@@ -118,29 +118,6 @@ def test_a_gap_restarts_the_grid(healthy):
     assert len(found.quality.gaps) == 1
 
 
-@pytest.mark.slow
-def test_a_clock_that_starts_anew_with_a_segment(healthy):
-    """Two drives in one file, both on a clock from zero: windows have each drive's own time."""
-    again = drive(seed=2, seconds=12.0)
-    log = joined(healthy, again)
-    assert [float(log.time[part][0]) for part in log.segments()] == [0.0, 0.0]
-    found = estimate(log)
-    own = [span for part in (healthy, again) for span in spans(estimate(part))]
-    assert np.array(spans(found)) == pytest.approx(np.array(own))
-    assert [s for s, _ in spans(found)[10:]] == [2.0 * k for k in range(6)]
-    # the clock is only a label: on a continuous one the belief is the same
-    later = columns(log)
-    later["time"] = np.concatenate([healthy.time, again.time + 1000.0])
-    on = estimate(Log.from_arrays(**later))
-    for a, b in zip(found.windows, on.windows, strict=True):
-        assert int(a.window.n[0]) == int(b.window.n[0])
-        assert_same_belief(a.window.belief, b.window.belief)
-    # a drive from before the first one
-    earlier = columns(log)
-    earlier["time"] = np.concatenate([healthy.time + 500.0, again.time + 3.0])
-    assert [s for s, _ in spans(estimate(Log.from_arrays(**earlier)))[10:]] == [3.0 + 2.0 * k for k in range(6)]
-
-
 def test_segments_that_follow_at_once_are_still_two_drives(healthy):
     made = columns(healthy)
     made["segment"] = (healthy.time >= 5.0).astype(int)

@@ -13,7 +13,6 @@ from avtorch.inference.priors import (
     LogNormalPrior,
     LogSpaceNormal,
     QuadrantNormal,
-    Switch,
     default_jerk_noise_prior,
 )
 from avtorch.inference.quadrature import integrate
@@ -29,8 +28,7 @@ def priors() -> dict:
     cov = torch.tensor([[0.04, 0.01, 0.0], [0.01, 0.02, 0.0], [0.0, 0.0, 0.01]], dtype=F64).expand(WINDOWS, 3, 3)
     last = LogSpaceNormal(torch.tensor([[0.35, 0.9, 0.12]] * WINDOWS, dtype=F64).log(), cov)
     tight = LogNormalPrior(torch.tensor([0.25, 1.1, 0.1], dtype=F64), torch.tensor([0.05, 0.1, 0.5], dtype=F64))
-    switch = Switch(torch.tensor([True, False, True]), belief, last)
-    return {"first": None, "lambda": belief, "posterior": last, "log-normal": tight, "switch": switch}
+    return {"first": None, "lambda": belief, "posterior": last, "log-normal": tight}
 
 
 @pytest.mark.statistical
