@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -45,3 +46,21 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
         return told, memoryview(content)
 
     monkeypatch.setattr(apart, "_asked", asked)
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[[list[str]], str]:
+    """What a command line is refused with: exit code 2 and one printable line, without a traceback."""
+    from avtorch.cli import main
+
+    def said(arguments: list[str]) -> str:
+        capsys.readouterr()
+        assert main(arguments) == 2
+        told = capsys.readouterr()
+        assert "Traceback" not in told.out
+        assert told.err.startswith("avtorch: ")
+        assert told.err.endswith("\n")
+        assert told.err[:-1].isprintable(), told.err
+        return told.err
+
+    return said

@@ -127,31 +127,26 @@ def test_a_killed_run_goes_on_from_what_was_written_last(tmp_path: Path, monkeyp
     ],
 )
 def test_other_settings_are_refused_in_one_line(
-    interrupted: tuple[list[str], Path], capsys: pytest.CaptureFixture[str], more: list[str]
+    interrupted: tuple[list[str], Path], refused: Callable[[list[str]], str], more: list[str]
 ) -> None:
     line, out = interrupted
-    capsys.readouterr()
-    assert main([*line, *more, "--out", str(out)]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
+    told = refused([*line, *more, "--out", str(out)])
     assert f"{out / WINDOWS}: was begun with different settings; needs the same log and settings" in told
     assert "avtorch estimate --no-resume" in told
     assert main([*line, *more, "--no-resume", "--out", str(out)]) == 0
 
 
 def test_another_log_of_the_same_name_is_refused(
-    interrupted: tuple[list[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    interrupted: tuple[list[str], Path], tmp_path: Path, refused: Callable[[list[str]], str]
 ) -> None:
     (command, path, *options), out = interrupted
     other = tmp_path / "drive.csv"
     other.write_text(Path(path).read_text(encoding="utf-8").replace("15.0", "15.1", 1), encoding="utf-8")
-    assert main([command, str(other), *options, "--out", str(out)]) == 2
-    assert "was begun with different log;" in capsys.readouterr().err
+    assert "was begun with different log;" in refused([command, str(other), *options, "--out", str(out)])
 
 
-def test_a_damaged_file_is_refused(interrupted: tuple[list[str], Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_damaged_file_is_refused(interrupted: tuple[list[str], Path], refused: Callable[[list[str]], str]) -> None:
     line, out = interrupted
     content = (out / WINDOWS).read_bytes()
     (out / WINDOWS).write_bytes(content[: len(content) // 2])
-    assert main([*line, "--out", str(out)]) == 2
-    assert "is damaged" in capsys.readouterr().err
+    assert "is damaged" in refused([*line, "--out", str(out)])
