@@ -78,9 +78,9 @@ def test_where_nothing_was_driven_resistance_goes_on_along_a_line() -> None:
     assert abs(fell - true) < abs(true)  # nearer than a curve that is held
 
 
-def test_the_fit_is_the_same_every_time() -> None:
-    log = drive(plain, 3, seconds=80.0)
-    one, two = fit_pedals(log), fit_pedals(log)
+def test_the_fit_is_the_same_every_time(plain_drive: tuple[Log, PedalFit]) -> None:
+    log, one = plain_drive
+    two = fit_pedals(log)
     assert np.array_equal(one.map.pedals["brake"].accel, two.map.pedals["brake"].accel)
     assert one.map.T_L == two.map.T_L
 
