@@ -226,7 +226,7 @@ def test_a_row_is_named_by_its_first_line(tmp_path: Path, end: str) -> None:
 
 NUMBERS = {
     "１２": "is no number", "1_000": "is no number", "0x10": "is no number", "1e400": "is infinite",
-    "-1e400": "is infinite", "NaN": "is NaN", "infinity": "is infinite", "1\x0c": "is no number",
+    "-1e400": "is infinite", "NaN": "is NaN", "-Infinity": "is infinite", "1\x0c": "is no number",
     "\u20031": "is no number", "1.5.2": "is no number", "1e": "is no number", "٣": "is no number",
     "1" * 5000: "is infinite",
 }  # fmt: skip
