@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import gc
+import importlib
 import os
+import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,6 +17,11 @@ from tests import shapes
 shapes.install()
 
 pytest_plugins = ("tests.redraws", "pytester")
+
+
+def pytest_collection_finish() -> None:
+    """What the imports have left in memory stays; a search for garbage that goes through it takes 0.2 s."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
@@ -24,3 +34,39 @@ def data_dir() -> Path:
     path = Path(folder)
     assert path.is_dir(), f"AVTORCH_DATA={folder} is not a directory"
     return path
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Recordings and Parquet are read in the test's own process: most of a short test would be the start of another.
+
+    That one is in `io/formats/test_apart.py` and `io/test_log.py`.
+    """
+    from avtorch.io.formats import apart
+    from avtorch.io.formats.apart_process import answered
+
+    def asked(path: Any, kind: Any, wanted: Any) -> tuple[dict[str, Any], memoryview]:
+        reader = importlib.import_module(f"avtorch.io.formats.{kind.reader}")
+        wanted = wanted.pattern if isinstance(wanted, re.Pattern) else wanted if wanted is None else list(wanted)
+        told, content = answered(reader.open_file(path, kind), wanted)
+        return told, memoryview(content)
+
+    monkeypatch.setattr(apart, "_asked", asked)
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[[list[str]], str]:
+    """What a command line is refused with: exit code 2 and one printable line, without a traceback."""
+    from avtorch.cli import main
+
+    def said(arguments: list[str]) -> str:
+        capsys.readouterr()
+        assert main(arguments) == 2
+        told = capsys.readouterr()
+        assert "Traceback" not in told.out
+        assert told.err.startswith("avtorch: ")
+        assert told.err.endswith("\n")
+        assert told.err[:-1].isprintable(), told.err
+        return told.err
+
+    return said

@@ -6,6 +6,7 @@ import json
 import math
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -256,7 +257,7 @@ def test_refused_in_one_line(
     arguments: list[str],
     drive: Path,
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    refused: Callable[[list[str]], str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     (tmp_path / "file").write_text("precious")
@@ -268,12 +269,7 @@ def test_refused_in_one_line(
     named = [str(drive) if a == "LOG" else a for a in arguments]
     for word, place in places.items():
         named = [str(tmp_path / place) + a[len(word) :] if a == word or a.startswith(word + "/") else a for a in named]
-    assert main(named) == 2
-    said = capsys.readouterr()
-    assert said.err.startswith("avtorch: ")
-    assert said.err.count("\n") == 1
-    assert len(said.err) > 25, "too short to say what would be right"
-    assert "Traceback" not in said.out + said.err
+    assert len(refused(named)) > 25, "too short to say what would be right"
     assert not (tmp_path / "out").exists()
     assert list((tmp_path / "here").iterdir()) == []
     assert (tmp_path / "file").read_text() == "precious"
@@ -308,9 +304,8 @@ def test_an_interruption_leaves_the_older_answer_and_its_pictures(
     ],
     ids=lambda x: x[0] if isinstance(x, list) else "",
 )
-def test_what_is_missing_is_named(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(arguments) == 2
-    assert capsys.readouterr().err == f"avtorch: {said}\n"
+def test_what_is_missing_is_named(arguments: list[str], said: str, refused: Callable[[list[str]], str]) -> None:
+    assert refused(arguments) == f"avtorch: {said}\n"
 
 
 @pytest.mark.slow

@@ -473,22 +473,6 @@ def test_the_sign_of_everything_changes_no_fit_of_the_acceleration(drive: Log) -
 
 
 @pytest.mark.slow
-def test_a_drive_given_twice_halves_the_variance(drive: Log) -> None:
-    """Estimates stay within what the prior moves them by, and twice the rows halve that; spreads shrink by sqrt 2 to
-    the quarter that the recorder's lateness, of which its prior says most, and the noise, estimated anew, allow."""
-    one, two = _fits(drive, *EFFECTS), _fits([drive, drive], *EFFECTS)
-    for fits in (one, two):
-        assert max(EFFECTS, key=lambda name: fits[name].log_evidence if name in fits else -np.inf) == "dead_time"
-    single, double = one["dead_time"], two["dead_time"]
-    for a, b in ((single.parameters, double.parameters), (single.moved, double.moved)):
-        for key, q in a.items():
-            assert b[key].mean == pytest.approx(q.mean, abs=0.2 * q.sd)
-            assert b[key].sd == pytest.approx(q.sd / math.sqrt(2), rel=0.25)
-    # less what a parameter's price grows by, half of ln 2, and what the noise's estimate does
-    assert double.log_evidence == pytest.approx(2 * single.log_evidence, rel=0.15)  # type: ignore[operator]
-
-
-@pytest.mark.slow
 def test_a_diagnosis_of_a_drive_given_twice_is_the_same(drive: Log) -> None:
     one, two = (avtorch.diagnose(logs, effects=EFFECTS, pairs=False) for logs in ([drive], [drive, drive]))
     assert two.verdict.names == one.verdict.names == ("dead_time",)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -41,9 +42,6 @@ def test_no_command_waits_or_echoes(command: str, tmp_path: Path, capsys: pytest
     ],
     ids=lambda options: ascii(options[0][:12]),
 )
-def test_options_are_not_recited(options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_are_not_recited(options: list[str], tmp_path: Path, refused: Callable[[list[str]], str]) -> None:
     (tmp_path / "lap.csv").write_text("time,accel_cmd,accel,speed\n0,1,1,1\n0.1,1,1,1\n")
-    assert main(["estimate", str(tmp_path / "lap.csv"), *options, "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert said[:-1].isprintable()
-    assert len(said) < 500
+    assert len(refused(["estimate", str(tmp_path / "lap.csv"), *options, "--out", str(tmp_path / "out")])) < 500

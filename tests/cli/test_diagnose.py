@@ -238,9 +238,10 @@ def test_json_and_quiet(search: Search, drive: str, tmp_path: Path, capsys: pyte
     ],
 )
 def test_bad_arguments(
-    search: Search, drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], fault: str
+    search: Search, drive: str, tmp_path: Path, refused: Callable[[list[str]], str], options: list[str], fault: str
 ) -> None:
-    refused(["diagnose", drive, *options], fault, tmp_path, capsys)
+    assert fault in refused(["diagnose", drive, *options, "--out", str(tmp_path / "out")])
+    assert not (tmp_path / "out").exists()
     assert not search.calls
 
 
@@ -268,34 +269,26 @@ def test_a_manoeuvre_that_cannot_be_had_costs_no_answer(
     ],
 )
 def test_logs_that_lack_a_signal(
-    search: Search, tmp_path: Path, capsys: pytest.CaptureFixture[str], missing: tuple[str, ...], fault: str
+    search: Search, tmp_path: Path, refused: Callable[[list[str]], str], missing: tuple[str, ...], fault: str
 ) -> None:
     log = write(tmp_path / "poor.csv", **(columns() | dict.fromkeys(missing)))
-    refused(["diagnose", log], fault, tmp_path, capsys)
+    assert fault in refused(["diagnose", log, "--out", str(tmp_path / "out")])
     assert not search.calls
 
 
-def test_logs_that_cannot_be_used(search: Search, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_logs_that_cannot_be_used(search: Search, tmp_path: Path, refused: Callable[[list[str]], str]) -> None:
     by_hand = write(tmp_path / "by_hand.csv", **columns(), engaged=np.zeros(ROWS, int))
-    refused(["diagnose", by_hand], "by_hand.csv: has no row to use", tmp_path, capsys)
-    given = columns() | {"accel": None}
-    speed_only = write(tmp_path / "speed.csv", **given)
-    specific = ["--accel-kind", "specific-force"]
-    refused(["diagnose", speed_only, *specific], "speed.csv has no accel", tmp_path, capsys)
-    asked = ["--effects", "gust,sensor_lag"]
-    refused(["diagnose", speed_only, *asked], "found sensor_lag, which no log without accel can show", tmp_path, capsys)
-    refused(["diagnose", str(tmp_path / "missing.csv")], "missing.csv", tmp_path, capsys)
-    refused(["diagnose"], "LOGS: missing; see avtorch diagnose --help", tmp_path, capsys)
-    assert main(["diagnose", speed_only, "--out", str(tmp_path / "speed.csv")]) == 2
-    assert "speed.csv: cannot be made (File exists)" in capsys.readouterr().err
-
-
-def refused(arguments: list[str], fault: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*arguments, "--out", str(tmp_path / "out")]) == 2
-    told = capsys.readouterr().err
-    assert fault in told
-    assert told.count("\n") == 1
+    speed_only = write(tmp_path / "speed.csv", **(columns() | {"accel": None}))
+    for arguments, fault in (
+        ([by_hand], "by_hand.csv: has no row to use"),
+        ([speed_only, "--accel-kind", "specific-force"], "speed.csv has no accel"),
+        ([speed_only, "--effects", "gust,sensor_lag"], "found sensor_lag, which no log without accel can show"),
+        ([str(tmp_path / "missing.csv")], "missing.csv"),
+        ([], "LOGS: missing; see avtorch diagnose --help"),
+    ):
+        assert fault in refused(["diagnose", *arguments, "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out").exists()
+    assert "speed.csv: cannot be made (File exists)" in refused(["diagnose", speed_only, "--out", speed_only])
 
 
 # --- what a person reads

@@ -28,7 +28,9 @@ def drive(tmp_path: Path, rotating_seed: int) -> Path:
 
 
 @pytest.mark.statistical
-def test_from_a_file_to_the_page(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_a_file_to_the_page(
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     out, estimates = tmp_path / "out", tmp_path / "estimates.json"
     log = Log.read(drive)
     windows = [{"end_s": log.epoch_s + 30.0, "alerts": ["stability"]}]
@@ -69,6 +71,8 @@ def test_from_a_file_to_the_page(drive: Path, tmp_path: Path, capsys: pytest.Cap
     assert "alarms of the monitor (stability at 30.0 s)" in page
     # the same command again goes on from kept fits, to the same answer
     before = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
+    # its pictures were drawn once
+    monkeypatch.setattr("avtorch.report.page.inline_svg", lambda *_: "")
     assert main([*command[:-1], "--quiet"]) == 0
     again = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
     assert before.pop("files").keys() == again.pop("files").keys()  # a page tells when it was made

@@ -6,12 +6,12 @@ import inspect
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from avtorch.cli import main
 from avtorch.cli.app import alone_in_out, app
 from avtorch.io import sole_use
 
@@ -47,15 +47,13 @@ ARGUMENTS = {
 @pytest.mark.parametrize("url", ["s3://bucket/out", "file:///tmp/out"])
 @pytest.mark.parametrize("command", [*ARGUMENTS, "watch --state"])
 def test_a_url_for_the_folder_is_refused(
-    command: str, url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    command: str, url: str, tmp_path: Path, refused: Callable[[list[str]], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert set(ARGUMENTS) == {*COMMANDS, "watch"}
     monkeypatch.chdir(tmp_path)
     (tmp_path / "drive.csv").write_text("time,accel_cmd,accel\n")
     option = "--state" if command == "watch --state" else "--out"
-    assert main([*ARGUMENTS[command.split()[0]], option, url]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
+    told = refused([*ARGUMENTS[command.split()[0]], option, url])
     assert f"{option}: found '{url}'" in told
     assert "of this machine" in told
     assert [path.name for path in tmp_path.iterdir()] == ["drive.csv"]

@@ -108,27 +108,6 @@ def test_a_drivers_rows_and_those_at_standstill_are_masked():
     assert not bool(clean.windows[4].window.belief.excited)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("rest", ["cruise", "standstill", "constant"])
-def test_a_window_that_says_nothing_leaves_the_belief(healthy, rest):
-    n, rng = 1000, np.random.default_rng(4)
-    zero = np.zeros(n)
-    speed = np.full(n, 0.0 if rest == "standstill" else 20.0)
-    jerk = 0.1 * rng.standard_normal(n) if rest == "cruise" else zero
-    accel = {"cruise": 0.005 * rng.standard_normal(n), "standstill": zero, "constant": np.full(n, 0.45)}[rest]
-    command = {"cruise": 0.005 * rng.standard_normal(n), "standstill": zero - 0.5, "constant": np.full(n, 0.5)}[rest]
-    extra = {"time": 20.0 + 0.01 * np.arange(n), "accel": accel, "accel_cmd": command, "speed": speed, "jerk": jerk}
-    made = columns(healthy)
-    log = Log.from_arrays(**{name: np.concatenate([made[name], extra[name]]) for name in extra})
-    for mode in ("lambda", "posterior", "forgetting"):
-        windows = estimate(log, mode=mode, settings=QUICK).windows
-        assert [bool(w.window.belief.excited) for w in windows[10:]] == [False] * 5
-        assert bool(windows[2].window.belief.excited)
-        for w in windows[10:]:
-            assert_same_belief(w.window.belief, windows[9].window.belief)
-            assert w.report.names() == []
-
-
 def test_a_gap_restarts_the_grid(healthy):
     keep = (healthy.time < 7.3) | (healthy.time >= 9.55)
     log = Log.from_arrays(**{k: v[keep] for k, v in columns(healthy).items() if k not in ("engaged", "segment")})
@@ -137,29 +116,6 @@ def test_a_gap_restarts_the_grid(healthy):
     assert np.array(spans(found)) == pytest.approx(np.array(expected), abs=0.011)
     assert [int(w.window.n[0]) for w in found.windows[1:]] == pytest.approx([200, 200, 130, *[200] * 5, 45], abs=1)
     assert len(found.quality.gaps) == 1
-
-
-@pytest.mark.slow
-def test_a_clock_that_starts_anew_with_a_segment(healthy):
-    """Two drives in one file, both on a clock from zero: windows have each drive's own time."""
-    again = drive(seed=2, seconds=12.0)
-    log = joined(healthy, again)
-    assert [float(log.time[part][0]) for part in log.segments()] == [0.0, 0.0]
-    found = estimate(log)
-    own = [span for part in (healthy, again) for span in spans(estimate(part))]
-    assert np.array(spans(found)) == pytest.approx(np.array(own))
-    assert [s for s, _ in spans(found)[10:]] == [2.0 * k for k in range(6)]
-    # the clock is only a label: on a continuous one the belief is the same
-    later = columns(log)
-    later["time"] = np.concatenate([healthy.time, again.time + 1000.0])
-    on = estimate(Log.from_arrays(**later))
-    for a, b in zip(found.windows, on.windows, strict=True):
-        assert int(a.window.n[0]) == int(b.window.n[0])
-        assert_same_belief(a.window.belief, b.window.belief)
-    # a drive from before the first one
-    earlier = columns(log)
-    earlier["time"] = np.concatenate([healthy.time + 500.0, again.time + 3.0])
-    assert [s for s, _ in spans(estimate(Log.from_arrays(**earlier)))[10:]] == [3.0 + 2.0 * k for k in range(6)]
 
 
 def test_segments_that_follow_at_once_are_still_two_drives(healthy):
@@ -237,14 +193,6 @@ def test_the_latent_form_as_it_is_answered(rotating_seed):
             assert stat["q05"] < stat["mean"] < stat["q95"]
             # the reverse of a 5 sigma interval, in the logarithm as the posterior is skewed
             assert abs(np.log(stat["mean"] / truth)) < BAR * stat["sd"] / stat["mean"]
-
-
-def test_the_jerk_form_as_it_is_answered(healthy):
-    answer = estimates_answer(estimate(healthy, settings=QUICK))
-    assert answer["schema"] == "avtorch.estimates/1"
-    for window in answer["windows"]:
-        assert "noise" not in window
-        assert set(window["sigma"]) == {"mean", "sd", "q05", "q95"}
 
 
 @pytest.mark.slow

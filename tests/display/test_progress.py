@@ -112,12 +112,6 @@ def test_in_a_terminal_only_where_it_is_asked_for(
     assert ("estimate" in stream.getvalue()) is (terminal and asked is True)
 
 
-def test_a_diagnosis_tells_the_stages_of_the_whole(outputs: list[Output]) -> None:
-    avtorch.diagnose(log(), effects=["sensor_bias"], pairs=False)
-    assert len(outputs) == 1
-    assert outputs[0].seen[0]["text/plain"].endswith("diagnose: recorder")
-
-
 @pytest.mark.parametrize(
     "long",
     [

@@ -237,11 +237,11 @@ def test_a_fixed_step_is_taken_a_whole_number_of_times(build: Build, fmi: int) -
     assert "steps of 0.005 s, no others" in car.notes
 
 
-@pytest.mark.parametrize("dt", [0.008, 0.002])
-def test_another_step_is_refused_with_those_that_are_right(build: Build, dt: float) -> None:
+def test_another_step_is_refused_with_those_that_are_right(build: Build) -> None:
     car = build.open(build.fmu(step=0.005, variable_step=False))
-    with pytest.raises(InputError, match=rf"dt: found {dt:g} s; .* takes steps of 0.005 s, .* 0.005 or 0.01 s"):
-        driven(car, dt)
+    for dt in (0.008, 0.002):
+        with pytest.raises(InputError, match=rf"dt: found {dt:g} s; .* takes steps of 0.005 s, .* 0.005 or 0.01 s"):
+            driven(car, dt)
 
 
 def test_a_step_that_is_only_preferred_is_divided(build: Build) -> None:
@@ -295,21 +295,19 @@ def test_side_by_side_each_in_a_process_of_its_own(build: Build) -> None:
     np.testing.assert_allclose(driven(car), expected(), **CLOSE)  # its own process goes on
 
 
-@pytest.mark.parametrize(
-    ("values", "text"),
-    [
-        ({"mass": 1.0}, r"parameters: found 'mass', needs one of omega, damping"),
-        ({"v0": 1.0}, r"parameters: found 'v0'"),
-        ({"omega": np.nan}, r"omega: found nan, needs a finite number"),
-        ({"omega": 31.0}, r"omega: found 31.0, needs a finite number from 0.1 to 30"),
-        ({"fault": 0.5}, r"fault: found 0.5, needs a whole number"),
-    ],
-)
-def test_parameters_that_do_not_fit_are_refused(build: Build, values: dict[str, float], text: str) -> None:
+def test_parameters_that_do_not_fit_are_refused(build: Build) -> None:
     given = fmus.variables()
     given["omega"] |= {"min": 0.1, "max": 30.0}
-    with pytest.raises(InputError, match=text):
-        build.open(build.fmu(given=given)).with_parameters(values)
+    car = build.open(build.fmu(given=given))
+    for name, value, text in (
+        ("mass", 1.0, r"parameters: found 'mass', needs one of omega, damping"),
+        ("v0", 1.0, r"parameters: found 'v0'"),
+        ("omega", np.nan, r"omega: found nan, needs a finite number"),
+        ("omega", 31.0, r"omega: found 31.0, needs a finite number from 0.1 to 30"),
+        ("fault", 0.5, r"fault: found 0.5, needs a whole number"),
+    ):
+        with pytest.raises(InputError, match=text):
+            car.with_parameters({name: value})
 
 
 # failures ----------------------------------------------------------------------------------------------------------

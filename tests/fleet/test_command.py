@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,7 @@ def test_a_cluster_of_its_own_tells_where_its_dashboard_is(here: Path, capsys: p
 
 
 def test_the_extra_is_named_where_it_is_missing(
-    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    here: Path, refused: Callable[[list[str]], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_fleet(here / "logs", {"red": 0.3})
     find = importlib.util.find_spec
@@ -73,8 +74,7 @@ def test_the_extra_is_named_where_it_is_missing(
         return None if name == "distributed" else find(name, *more)
 
     monkeypatch.setattr(importlib.util, "find_spec", without)
-    assert main(["fleet", "logs", "--out", "out"]) == 2
-    told = capsys.readouterr().err
+    told = refused(["fleet", "logs", "--out", "out"])
     assert told == "avtorch: a fleet needs distributed, which is not installed: pip install 'avtorch[fleet]'\n"
     assert not (here / "out").exists()
 
@@ -94,18 +94,14 @@ def test_the_extra_is_named_where_it_is_missing(
     ],
 )
 def test_bad_options_are_one_line(
-    options: list[str], message: str, here: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str], message: str, here: Path, refused: Callable[[list[str]], str]
 ) -> None:
     write_fleet(here / "logs", {"red": 0.3})
-    assert main(["fleet", "logs", "--out", "out", *options]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith(f"avtorch: {message}")
-    assert told.count("\n") == 1
+    assert refused(["fleet", "logs", "--out", "out", *options]).startswith(f"avtorch: {message}")
     assert not (here / "out").exists()
 
 
-def test_a_file_in_place_of_the_folder_is_refused(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_in_place_of_the_folder_is_refused(here: Path, refused: Callable[[list[str]], str]) -> None:
     write_fleet(here / "logs", {"red": 0.3})
     (here / "out").write_text("a file")
-    assert main(["fleet", "logs", "--out", "out"]) == 2
-    assert "out: cannot be made" in capsys.readouterr().err
+    assert "out: cannot be made" in refused(["fleet", "logs", "--out", "out"])

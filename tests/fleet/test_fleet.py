@@ -6,7 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,26 @@ def computed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
     return done
 
 
+@dataclass(frozen=True)
+class Ran:
+    """A fleet of two cars and two broken logs, and its answer."""
+
+    logs: Path
+    out: Path
+    answer: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory, scheduler: str) -> Ran:
+    folder = tmp_path_factory.mktemp("ran")
+    write_fleet(folder / "logs", {"red": 0.4, "blue": 0.3})
+    for car, text in {"green": "time,speed\n0,1\n", "black": "\x00\x01 no table"}.items():
+        (folder / "logs" / car).mkdir()
+        (folder / "logs" / car / "drive.csv").write_text(text)
+    answer = run_fleet(folder / "logs", folder / "out", settings=QUICK, scheduler=scheduler)
+    return Ran(folder / "logs", folder / "out", answer)
+
+
 def stamps(out: Path) -> dict[str, int]:
     return {str(p): p.stat().st_mtime_ns for p in sorted(out.rglob("*.parquet"))}
 
@@ -60,19 +80,15 @@ def test_rows_are_what_estimate_gives(tmp_path: Path, scheduler: str) -> None:
         assert (row["car"], row["status"], row["error"]) == ("drive", "done", None)
 
 
-def test_polars_reads_the_folder_of_windows(tmp_path: Path, scheduler: str) -> None:
+def test_polars_reads_the_folder_of_windows(ran: Ran) -> None:
     polars = pytest.importorskip("polars")
-    write_fleet(tmp_path / "logs", {"red": 0.4, "blue": 0.8})
-    (tmp_path / "logs" / "green").mkdir()
-    (tmp_path / "logs" / "green" / "drive.csv").write_text("a,b\n1,2\n")
-    run_fleet(tmp_path / "logs", tmp_path / "out", settings=QUICK, scheduler=scheduler)
-    expected = read_rows(tmp_path / "out", "windows")
-    found = polars.read_parquet(tmp_path / "out" / "windows")
+    expected = read_rows(ran.out, "windows")
+    found = polars.read_parquet(ran.out / "windows")
     assert found.columns == expected.column_names == schema("estimate").names
     assert found.height == expected.num_rows
-    # one without an answer, and four windows of 2 s of each car's 8 s
+    # two without an answer, and four windows of 2 s of each car's 8 s
     counts = dict(found.group_by("car").len().iter_rows())
-    assert counts == {"red": 4, "blue": 4, "green": 1}
+    assert counts == {"red": 4, "blue": 4, "green": 1, "black": 1}
     used = found.filter(polars.col("status") == "done").sort("car", "window")
     rows = [row for row in expected.to_pylist() if row["status"] == "done"]
     rows.sort(key=lambda row: (row["car"], row["window"]))
@@ -80,20 +96,15 @@ def test_polars_reads_the_folder_of_windows(tmp_path: Path, scheduler: str) -> N
         assert used[column].to_list() == [row[column] for row in rows]
 
 
-def test_a_broken_log_is_a_row_that_says_why_and_the_others_are_done(tmp_path: Path, scheduler: str) -> None:
-    write_fleet(tmp_path / "logs", {"red": 0.4, "blue": 0.3})
-    for car, text in {"green": "time,speed\n0,1\n", "black": "\x00\x01 no table"}.items():
-        (tmp_path / "logs" / car).mkdir()
-        (tmp_path / "logs" / car / "drive.csv").write_text(text)
-    answer = run_fleet(tmp_path / "logs", tmp_path / "out", settings=QUICK, scheduler=scheduler)
-    assert {car["car"]: car["reason"] for car in answer["cars"]} == {
+def test_a_broken_log_is_a_row_that_says_why_and_the_others_are_done(ran: Ran) -> None:
+    assert {car["car"]: car["reason"] for car in ran.answer["cars"]} == {
         "black": "failed",
         "green": "failed",
         "red": "sound",
         "blue": "sound",
     }
     for dataset in ("checks", "windows"):
-        rows = {row["car"]: row for row in read_rows(tmp_path / "out", dataset).to_pylist()}
+        rows = {row["car"]: row for row in read_rows(ran.out, dataset).to_pylist()}
         assert {car: row["status"] for car, row in rows.items()} == {
             "red": "done",
             "blue": "done",
@@ -104,17 +115,13 @@ def test_a_broken_log_is_a_row_that_says_why_and_the_others_are_done(tmp_path: P
         assert "accel_cmd" in rows["green"]["error"] or "from row to row" in rows["green"]["error"]
 
 
-def test_a_second_call_computes_nothing(tmp_path: Path, scheduler: str, computed: list[tuple[str, str]]) -> None:
-    write_fleet(tmp_path / "logs", {"red": 0.4, "blue": 0.3})
-    (tmp_path / "logs" / "blue" / "broken.csv").write_text("a,b\n1,2\n")
-    first = run_fleet(tmp_path / "logs", tmp_path / "out", settings=QUICK, scheduler=scheduler)
-    assert first["work"] == {"kept": 0, "computed": 6}
-    before = stamps(tmp_path / "out")
-    computed.clear()
+def test_a_second_call_computes_nothing(ran: Ran, computed: list[tuple[str, str]]) -> None:
+    assert ran.answer["work"] == {"kept": 0, "computed": 8}
+    before = stamps(ran.out)
     # no cluster either: there is none at this address
-    again = run_fleet(tmp_path / "logs", tmp_path / "out", settings=QUICK, scheduler="tcp://127.0.0.1:1")
-    assert (again["work"], computed, stamps(tmp_path / "out")) == ({"kept": 6, "computed": 0}, [], before)
-    assert again["cars"] == first["cars"]
+    again = run_fleet(ran.logs, ran.out, settings=QUICK, scheduler="tcp://127.0.0.1:1")
+    assert (again["work"], computed, stamps(ran.out)) == ({"kept": 8, "computed": 0}, [], before)
+    assert again["cars"] == ran.answer["cars"]
 
 
 @pytest.mark.slow

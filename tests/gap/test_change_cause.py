@@ -68,6 +68,12 @@ def _model(before: Log, after: Log) -> JointModel:
     return JointModel.of(DriveData.of([before, after]), 1, plant([]))
 
 
+@pytest.fixture(scope="module")
+def model() -> JointModel:
+    """Of two drives of one car."""
+    return _model(*(log_of(seconds=60.0, seed=seed) for seed in (1, 2)))
+
+
 def _pair(case: Case, seed: int, both: Sequence[Effect] = ()) -> tuple[Log, Log]:
     rng = np.random.default_rng(seed)
     one, two = (int(x) for x in rng.integers(2**31, size=2))
@@ -131,8 +137,7 @@ def test_what_is_gone_has_the_opposite_sign(rotating_seed: int) -> None:
     assert str(part).startswith("less constant_resistance (resistance -")
 
 
-def test_both_sides_share_what_has_not_changed() -> None:
-    model = _model(*(log_of(seconds=60.0, seed=seed) for seed in (1, 2)))
+def test_both_sides_share_what_has_not_changed(model: JointModel) -> None:
     gain = of_car("K_L")
     x = np.append(model.start.x, -0.3)
     fit = model.at((gain,), x)
@@ -149,8 +154,7 @@ def test_both_sides_share_what_has_not_changed() -> None:
     assert fit.objective < same.objective - 10
 
 
-def test_an_effect_of_both_sides_may_be_larger_on_one() -> None:
-    model = _model(*(log_of(seconds=60.0, seed=seed) for seed in (1, 2)))
+def test_an_effect_of_both_sides_may_be_larger_on_one(model: JointModel) -> None:
     both = of_effect(EFFECTS["dead_band"], ((0.1,),), "both")
     fit = model.at((both,), np.append(model.start.x, 0.1))
     (name,) = (c.name for c in both.coordinates)
@@ -161,9 +165,8 @@ def test_an_effect_of_both_sides_may_be_larger_on_one() -> None:
     assert [h.effects.count("dead_band") for h in fit.sides] == [1, 1]
 
 
-def test_scores_of_blocks_add_up_to_the_gradient() -> None:
+def test_scores_of_blocks_add_up_to_the_gradient(model: JointModel) -> None:
     """The transform is orthonormal: what rows of a block say of a coordinate sums to what the coefficients say."""
-    model = _model(*(log_of(seconds=60.0, seed=seed) for seed in (1, 2)))
     fit = model.start
     for k, h in enumerate(fit.sides):
         left = model.left(fit, h)
@@ -247,21 +250,6 @@ def test_the_heading_of_one_drive_and_two_simulators_is_of_the_simulators() -> N
 def _text(comparison: Comparison) -> str:
     cells = [cell for t in comparison_tables(comparison) for row in (t.columns, *t.rows) for cell in row]
     return " | ".join(cells)
-
-
-@pytest.mark.parametrize(
-    ("effects", "message"),
-    [
-        (["sensor_bais"], "effect: found 'sensor_bais', needs an effect's name; perhaps sensor_bias"),
-        ("sensor_bias", "effects: found 'sensor_bias', needs a list of names or classes"),
-        ([3], "effects: found '3', needs names or classes of effects"),
-        ([Log], "effects: found .*, needs names or classes of effects"),
-    ],
-)
-def test_candidates_that_are_no_effects(effects: Sequence[str], message: str) -> None:
-    log = log_of(seconds=20.0)
-    with pytest.raises(InputError, match=message):
-        avtorch.compare(log, log, effects=effects)
 
 
 def test_a_side_too_short_for_a_cause() -> None:

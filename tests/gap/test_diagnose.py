@@ -10,7 +10,6 @@ import avtorch
 from avtorch import diagnose
 from avtorch.errors import InputError
 from avtorch.gap.effects.sensor_bias import SensorBias
-from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log
 from benchmarks.blindtest import draw_case
 from tests.gap.cars import log_of
@@ -45,17 +44,6 @@ def test_wrong_arguments_are_refused() -> None:
         avtorch.diagnose(log, posterior="guess")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="accel_kind: found 'gravity'"):
         avtorch.diagnose(log, accel_kind="gravity")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="no_such"):
-        avtorch.diagnose(log, effects=["no_such"])
-
-
-@pytest.mark.slow
-def test_the_repaired_simulator_reads_back() -> None:
-    answer = avtorch.diagnose(_drive("sensor_bias"), effects=["sensor_bias"], pairs=False)
-    if answer.plant is None:
-        pytest.fail(f"verdict {answer.verdict.name}, expected a plain bias to be named")
-    again = GapPlant.from_toml(answer.plant.to_toml())
-    assert [e.name for e in again.effects] == [e.name for e in answer.plant.effects]
 
 
 @pytest.mark.slow

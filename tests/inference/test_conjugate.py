@@ -7,14 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, JerkStatistics
 from avtorch.inference.priors import (
     Joint,
     LogNormalPrior,
     LogSpaceNormal,
     QuadrantNormal,
-    Switch,
     default_jerk_noise_prior,
 )
 from avtorch.inference.quadrature import integrate
@@ -30,8 +28,7 @@ def priors() -> dict:
     cov = torch.tensor([[0.04, 0.01, 0.0], [0.01, 0.02, 0.0], [0.0, 0.0, 0.01]], dtype=F64).expand(WINDOWS, 3, 3)
     last = LogSpaceNormal(torch.tensor([[0.35, 0.9, 0.12]] * WINDOWS, dtype=F64).log(), cov)
     tight = LogNormalPrior(torch.tensor([0.25, 1.1, 0.1], dtype=F64), torch.tensor([0.05, 0.1, 0.5], dtype=F64))
-    switch = Switch(torch.tensor([True, False, True]), belief, last)
-    return {"first": None, "lambda": belief, "posterior": last, "log-normal": tight, "switch": switch}
+    return {"first": None, "lambda": belief, "posterior": last, "log-normal": tight}
 
 
 @pytest.mark.statistical
@@ -131,11 +128,3 @@ def test_same_generator_same_draws_and_windows_do_not_mix(make_windows) -> None:
     louder = replace(w.statistics, jj=w.statistics.jj * torch.tensor([1.0, 4.0], dtype=F64))
     other = sample_conjugate(JerkDensity(louder), draws=500, generator=torch.Generator().manual_seed(7))
     assert other.posterior.mean[1, 2] > 1.5 * first.posterior.mean[1, 2]
-
-
-def test_bad_input_names_itself(make_windows) -> None:
-    density = JerkDensity(make_windows(1, [1.0]).statistics)
-    with pytest.raises(InputError, match="draws: 1"):
-        sample_conjugate(density, draws=1)
-    with pytest.raises(InputError, match="proposals: 0"):
-        sample_conjugate(density, proposals=0)

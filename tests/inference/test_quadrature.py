@@ -11,11 +11,10 @@ from scipy import stats
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference import JerkDensity, SamplerSettings, find_mode, sample
 from avtorch.inference.map import Mode
-from avtorch.inference.priors import Joint, LogSpaceNormal, QuadrantNormal, default_jerk_noise_prior
+from avtorch.inference.priors import LogSpaceNormal
 from avtorch.inference.quadrature import integrate
-from tests.bars import BAR, LEVEL
+from tests.bars import LEVEL
 
 F64 = torch.float64
 
@@ -150,30 +149,6 @@ def test_mass_without_end_is_flagged() -> None:
     found = integrate(density, mode=mode)
     assert found.converged.tolist() == [False, True]
     assert found.edge[0] > 0.1
-
-
-@pytest.mark.statistical
-@pytest.mark.slow
-def test_sampler_agrees_on_cars(make_windows, rotating_seed: int, draws_factor: int) -> None:
-    """Algorithm 1 is held to quadrature, and quadrature to a grid twice as fine."""
-    w = make_windows(rotating_seed, [0.05, 0.4, 3.0], T=[0.3, 1.5, 0.1], K=[1.0, 0.5, 0.8])
-    belief = Joint(QuadrantNormal(torch.tensor([[0.4, 0.9]] * 3, dtype=F64), 0.25), default_jerk_noise_prior())
-    density = JerkDensity(w.statistics, belief)
-    mode = find_mode(density)
-    found, fine = integrate(density, mode=mode), integrate(density, mode=mode, nodes=81)
-    assert found.converged.all()
-    assert (((found.mean - fine.mean) / fine.sd).abs() < 1e-5).all()
-    for q in (0.05, 0.5, 0.95):
-        assert (((found.quantile(q) - fine.quantile(q)) / fine.sd).abs() < 1e-3).all()
-    chains = 128 * draws_factor
-    g = torch.Generator().manual_seed(rotating_seed)
-    posterior = sample(density, SamplerSettings(chains=chains, draws=150), generator=g, mode=mode)
-    score = ((posterior.draws - found.mean) / found.sd).mean(1)
-    # 5 sigma of the chains' means, and the constant step's own bias
-    bars = BAR * score.std(0) / math.sqrt(chains) + torch.tensor([0.04, 0.01, 0.01], dtype=F64)[:, None]
-    assert (score.mean(0).abs() < bars).all()
-    below = (posterior.draws < found.quantile(0.95)).double().mean(1)
-    assert ((below.mean(0) - 0.95).abs() < BAR * below.std(0) / math.sqrt(chains) + 0.01).all()
 
 
 @pytest.mark.statistical

@@ -117,18 +117,6 @@ def test_resume_is_equal_to_the_bit(options):
     assert q.equal(y)
 
 
-def test_resume_brings_its_generator_along():
-    x = leaf(4, 6)
-    optimizer = SGLD([x], 0.1, generator=generator(3))
-    optimizer.step(lambda: energy(x))
-    y = x.detach().clone().requires_grad_()
-    resumed = SGLD([y], 0.1)
-    resumed.load_state_dict(optimizer.state_dict())
-    optimizer.step(lambda: energy(x))
-    resumed.step(lambda: energy(y))
-    assert x.equal(y)
-
-
 def test_a_deep_copy_walks_on_alike():
     x = leaf(4, 6)
     optimizer = SGLD([x], 0.1, noise="averaged", generator=generator(3))

@@ -86,15 +86,6 @@ def test_the_end_of_the_open_window_is_known(drive):
     assert stream.closes_at is None
 
 
-def test_sample_by_sample_equals_one_block(drive):
-    expected = new().feed(*block(drive, slice(0, 450)))
-    stream, windows = new(), []
-    for k in range(450):
-        windows += stream.feed(*block(drive, slice(k, k + 1)))
-        assert stream.state_dict()["rows"]["time"].shape[-1] <= 201
-    assert_same(expected, windows)
-
-
 @pytest.mark.slow
 def test_memory_is_bounded(drive):
     """After an hour of rows the state is as large as after the first window, and what a block brings is not kept."""

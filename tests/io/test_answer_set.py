@@ -14,7 +14,7 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.io import answer_set, atomic, read_answer, sole_use, write_json
-from tests.faulty_disk import disk, fails, interrupts, old_or_new, visible
+from tests.faulty_disk import disk, fails, interrupts, old_or_new, tree, visible
 
 NAMES = ("a.json", "b.png", "c.csv", "d.toml")
 
@@ -68,6 +68,7 @@ class Sweep:
 
     def __init__(self, tmp_path: Path, start: Callable[[Path], None]) -> None:
         self.tmp_path, self.n = tmp_path, 0
+        self.followed: set[tuple] = set()
         (tmp_path / "start").mkdir()
         start(tmp_path / "start" / "out")
         self.old, self.new = visible(self.fresh()), {}
@@ -83,12 +84,14 @@ class Sweep:
         return here / "out"
 
     def judge(self, folder: Path) -> str:
-        """The new promise; and the next answer clears up what is left."""
-        found = old_or_new(folder, "a.json", self.old, self.new)
-        after(folder)
-        assert visible(folder) == self.new
-        assert read_answer(folder / "a.json")["of"] == "new"
-        assert [p.name for p in folder.iterdir() if p.name.startswith(".")] == []
+        """The new promise; and the next answer clears up what is left, tried once for folders that are alike."""
+        found, lies = old_or_new(folder, "a.json", self.old, self.new), tree(folder.parent)
+        if lies not in self.followed:
+            self.followed.add(lies)
+            after(folder)
+            assert visible(folder) == self.new
+            assert read_answer(folder / "a.json")["of"] == "new"
+            assert [p.name for p in folder.iterdir() if p.name.startswith(".")] == []
         shutil.rmtree(folder.parent)
         return found
 

@@ -21,6 +21,7 @@ def columns(**more: np.ndarray) -> dict:
     return given | more
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize("signal", SIGNALS)
 def test_one_of_them_stands_for_accel_cmd(signal: str, tmp_path: Path) -> None:
     values = np.linspace(0.0, 0.9, 1500)

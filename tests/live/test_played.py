@@ -70,6 +70,7 @@ def test_a_bag_gives_the_windows_of_its_rows(
     assert told.err.startswith("300 rows of 1 car, 3 windows")
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_it_goes_on_at_the_row_where_it_stopped(tmp_path: Path) -> None:
     path, told = parquet(tmp_path / "drive.parquet"), io.StringIO()
 
@@ -90,6 +91,7 @@ def test_it_goes_on_at_the_row_where_it_stopped(tmp_path: Path) -> None:
     assert watch.counts.rows == 300
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_it_is_played_at_its_rate(tmp_path: Path) -> None:
     begun = time.monotonic()
     rows = sum(len(batch.rows) for batch in PlayedLog(parquet(tmp_path / "d.parquet"), rate=20.0).batches(Event()))
@@ -97,6 +99,7 @@ def test_it_is_played_at_its_rate(tmp_path: Path) -> None:
     assert time.monotonic() - begun >= 5.98 / 20.0
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_what_cannot_be_played_is_refused(tmp_path: Path) -> None:
     rows = drive(1.5, 0.5, 6.0)
     Log.from_arrays(

@@ -81,9 +81,6 @@ def test_a_mistake_is_corrected_and_told(mistake: str, tmp_path: Path, fresh_see
             assert "accel" not in wrong
             continue
         assert np.allclose(values, right[name], rtol=1e-9, atol=1e-9), name
-    again = avtorch.check(path)
-    assert again.proposal is None, "a mapping is beside it now"
-    assert again.quality is not None
 
 
 def test_a_good_log_needs_nothing(tmp_path: Path, fresh_seed: int) -> None:
@@ -105,6 +102,10 @@ def test_units_that_the_data_cannot_tell_apart_are_told(tmp_path: Path, fresh_se
     assert found.proposal is not None
     assert found.proposal.unit["accel"] in ("mg", "cm/s2")
     assert any("the data allow accel in" in doubt for doubt in found.proposal.doubts)
+    (tmp_path / "drive.toml").write_text(found.proposal.toml("drive.csv"), encoding="utf-8")
+    again = avtorch.check(tmp_path / "drive.csv")
+    assert again.proposal is None, "a mapping is beside it now"
+    assert again.quality is not None
 
 
 def test_a_signal_that_arrives_now_and_then_is_held(tmp_path: Path, fresh_seed: int) -> None:

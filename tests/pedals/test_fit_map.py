@@ -10,12 +10,12 @@ from avtorch.io import Log
 from avtorch.pedals import PedalFit, fit_pedals
 from tests.pedals.cars import DEAD_ZONE, DELAY_S, LAG_S, drive, plain, with_dead_zone, with_motor_brake
 
-SEEDS = (11, 12)
+SEED = 11
 
 
-@pytest.fixture(scope="module", params=SEEDS)
-def plain_drive(request: pytest.FixtureRequest) -> tuple[Log, PedalFit]:
-    log = drive(plain, request.param)
+@pytest.fixture(scope="module")
+def plain_drive() -> tuple[Log, PedalFit]:
+    log = drive(plain, SEED)
     return log, fit_pedals(log)
 
 
@@ -42,9 +42,8 @@ def test_how_late_the_car_is(plain_drive: tuple[Log, PedalFit]) -> None:
     assert abs(fit.map.dead_time - DELAY_S) < 4 * fit.dead_time_sd
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_map_is_off_by_less_than_wind_and_road(seed: int) -> None:
-    log = drive(with_dead_zone, seed, force=0.1)
+def test_a_map_is_off_by_less_than_wind_and_road() -> None:
+    log = drive(with_dead_zone, SEED, force=0.1)
     made = fit_pedals(log).map
     assert log.speed is not None
     assert log.throttle is not None
@@ -55,17 +54,15 @@ def test_a_map_is_off_by_less_than_wind_and_road(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_dead_zone_is_found_on_a_calm_day(seed: int) -> None:
-    table = fit_pedals(drive(with_dead_zone, seed, force=0.02)).map.pedals["throttle"]
+def test_a_dead_zone_is_found_on_a_calm_day() -> None:
+    table = fit_pedals(drive(with_dead_zone, SEED, force=0.02)).map.pedals["throttle"]
     slope = np.diff(table.accel, axis=0) / np.diff(table.pedal)[:, None]
     inside, beyond = table.pedal[1:] <= DEAD_ZONE, table.pedal[:-1] >= DEAD_ZONE
     assert slope[inside].mean() < 0.5 * slope[beyond].mean()
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_where_nothing_was_driven_resistance_goes_on_along_a_line(seed: int) -> None:
-    log = drive(with_motor_brake, seed)
+def test_where_nothing_was_driven_resistance_goes_on_along_a_line() -> None:
+    log = drive(with_motor_brake, SEED)
     assert log.speed is not None
     made = fit_pedals(log).map
     assert made.driven == pytest.approx(
@@ -81,9 +78,9 @@ def test_where_nothing_was_driven_resistance_goes_on_along_a_line(seed: int) -> 
     assert abs(fell - true) < abs(true)  # nearer than a curve that is held
 
 
-def test_the_fit_is_the_same_every_time() -> None:
-    log = drive(plain, 3, seconds=80.0)
-    one, two = fit_pedals(log), fit_pedals(log)
+def test_the_fit_is_the_same_every_time(plain_drive: tuple[Log, PedalFit]) -> None:
+    log, one = plain_drive
+    two = fit_pedals(log)
     assert np.array_equal(one.map.pedals["brake"].accel, two.map.pedals["brake"].accel)
     assert one.map.T_L == two.map.T_L
 

@@ -90,7 +90,7 @@ def test_a_free_form_that_loses_in_the_budgets_runs_is_not_handed_back(named: fl
 
 def test_the_gust_beside_a_free_form_is_not_handed_back() -> None:
     """The form takes a part of it; what is left is not known."""
-    back = found(mapped=True).beside(plant([Gust(0.3, 5.0), ConstantResistance(0.1)]))
+    back = found(True).beside(plant([Gust(0.3, 5.0), ConstantResistance(0.1)]))
     assert [e.name for e in back.effects if e.name in ("gust", "constant_resistance")] == ["constant_resistance"]
 
 

@@ -96,10 +96,6 @@ def test_wrong_arguments_are_refused() -> None:
     for material in (0.0, 1.0, float(np.nan)):
         with pytest.raises(InputError, match="material"):
             budget_of(log, material=material)
-    with pytest.raises(InputError, match="perhaps dead_time"):
-        budget_of(log, effects=["dead_tim"])
-    with pytest.raises(InputError, match="needs 12 s"):
-        budget_of(log_of(seconds=7.0), effects=FEW)
 
 
 def test_blocks_without_a_frame_have_no_share_in_the_density() -> None:

@@ -24,8 +24,11 @@ from tests.gap.records import log_of
     ],
 )
 def test_effects_that_are_none(effects: object, message: str) -> None:
+    log = log_of(seconds=20.0)
     with pytest.raises(InputError, match=message):
-        avtorch.diagnose(log_of(seconds=20.0), effects=effects)  # type: ignore[arg-type]
+        avtorch.diagnose(log, effects=effects)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=message):
+        avtorch.compare(log, log, effects=effects)  # type: ignore[arg-type]
 
 
 def test_effects_by_name_and_by_class() -> None:

@@ -104,18 +104,6 @@ def test_drag_slows_and_sensor_faults_reach_the_log() -> None:
 # baselines and text ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "cls", [c for n, c in EFFECTS.items() if c.__module__.startswith("avtorch")], ids=lambda c: c.name
-)
-def test_text_round_trip(cls: type[Effect]) -> None:
-    for effect in (cls(), cls.neutral()):
-        car = plant([effect, gap.Gust()] if cls is not gap.Gust else [effect], T_L=0.41, K_L=0.93, sigma=0.2)
-        again = GapPlant.from_toml(car.to_toml())
-        assert again.to_toml() == car.to_toml()
-        assert again.effects == car.effects
-        assert (again.T_L, again.K_L, again.sigma) == (0.41, 0.93, 0.2)
-
-
 # values that neither the typical nor the neutral effect has, as a fit, a drive or a user may give them
 VARIANTS = {
     "gear_shift": [{"speeds": (4.0, 7.5)}, {"speeds": torch.tensor([4.0, 7.5], dtype=D)}],
@@ -131,16 +119,17 @@ VARIANTS = {
     "cls", [c for n, c in EFFECTS.items() if c.__module__.startswith("avtorch")], ids=lambda c: c.name
 )
 def test_text_round_trip_of_every_way_to_make_an_effect(cls: type[Effect]) -> None:
-    made = [cls(**given) for given in VARIANTS.get(cls.name, [])]
+    made = [cls(), cls.neutral(), *(cls(**given) for given in VARIANTS.get(cls.name, []))]
     made.append(cls(**{name: torch.tensor(float(x), dtype=D) for name, x in cls().values().items()}))
     # by the answer's own names, as a baseline in a file has them
     made.append(cls.of({name: float(x) for name, x in cls().report(torch.tensor(0.3, dtype=D)).items()}))
     drive = smooth_drive()
     made.append(plant([cls]).prepared(drive).effects[0])
     for effect in made:
-        car = plant([effect])
+        car = plant([effect, gap.Gust()] if cls is not gap.Gust else [effect], K_L=0.93, sigma=0.2)
         again = GapPlant.from_toml(car.to_toml())
         assert again.to_toml() == car.to_toml()
+        assert (again.T_L, again.K_L, again.sigma) == (car.T_L, 0.93, 0.2)
         for name, value in car.values().items():
             assert torch.equal(again.values()[name], value), name
         if not effect.random:
@@ -202,24 +191,6 @@ def test_a_string_that_names_a_file_is_one(tmp_path: Path, monkeypatch: pytest.M
             plant(baseline=missing)
     with pytest.raises(InputError, match=r"other\.toml: no such file"):
         plant(baseline=Path("other.toml"))
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("dead_tim=0.2", "found 'dead_tim', needs an effect's name; perhaps dead_time"),
-        ("zzz=0.2", "found 'zzz', needs one of aerodynamic_drag, "),
-        ("dead_time=fast", "number"),
-        ("dead_time.lag=0.2", "lag"),
-        ("T_L=-1", "T_L"),
-        ("[dead_time\n", "TOML"),
-        ("[dead_time]\ndelay_s = 'x'\n", "delay_s"),
-        ("[gap]\n", "gap"),
-    ],
-)
-def test_wrong_text_is_refused(text: str, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        GapPlant.from_toml(text)
 
 
 def test_wrong_arguments_are_refused(tmp_path: Path) -> None:

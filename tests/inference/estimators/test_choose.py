@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from avtorch.decision import Monitor, Supervisor
+from avtorch.decision import Monitor
 from avtorch.decision.monitor import DETECTORS
 from avtorch.decision.settings import Setting
 from avtorch.decision.watch import Watch
@@ -14,7 +14,6 @@ from avtorch.inference import BeliefStream, SamplerSettings
 from avtorch.inference.estimators import ESTIMATORS, make_estimator
 from avtorch.inference.form import JerkForm
 from avtorch.inference.latent import LatentForm
-from avtorch.vehicle import ClosedLoop, GLVDPlant, Leader
 from tests.bars import BAR
 
 F64 = torch.float64
@@ -81,14 +80,6 @@ def test_the_monitor_takes_every_belief(name, drive):
     for watched in watch.feed(time, columns, Setting(scenarios=2), usable=usable):
         assert watched.report.p_string_stable.isfinite().all()
         assert set(watched.report.alerts) == set(DETECTORS)
-
-
-@pytest.mark.parametrize("name", [n for n in NAMES if n != "sgld"])
-def test_the_supervisor_takes_every_stream(name):
-    loop = ClosedLoop(Leader.default(start=48), plant=GLVDPlant(1.5, 0.5), scenarios=2, seeds=3)
-    run = Supervisor(loop, stream=stream_of(name, window=2.0)).run(8.0)
-    assert len(run.windows) == 4
-    assert all(any(alert.detector == "accepted_change" for alert in alerts) for alerts in run.alerts)
 
 
 @pytest.mark.statistical

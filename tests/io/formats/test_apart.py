@@ -33,16 +33,15 @@ def test_the_answers_are_those_of_the_reader(tmp_path: Path, form: str) -> None:
     there, here = open_recording(path), open_here(path)
     assert (there.source, there.form, there.names) == (here.source, here.form, here.names)
     assert (there.units, there.remarks) == (here.units, here.remarks)
-    expected = here.read(here.names)
-    for names in (here.names[:1], here.names[::-1]):
-        found = there.read(names)
-        assert tuple(found) == names
-        for name in names:
-            assert np.array_equal(found[name].time, expected[name].time)
-            assert np.array_equal(found[name].values, expected[name].values, equal_nan=True)
+    names = here.names[:0:-1]  # some of them, in an order of their own
+    expected, found = here.read(names), there.read(names)
+    assert tuple(found) == names
+    for name in names:
+        assert np.array_equal(found[name].time, expected[name].time)
+        assert np.array_equal(found[name].values, expected[name].values, equal_nan=True)
+        assert found[name].values.flags.writeable
     # those that share a clock there share it here
     assert len({id(c.time) for c in found.values()}) == len({id(c.time) for c in expected.values()})
-    assert found[here.names[0]].values.flags.writeable
 
 
 @pytest.mark.slow

@@ -34,6 +34,7 @@ def timetable() -> pd.DataFrame:
     return pd.DataFrame({"AccReq": COMMAND, "VehSpd": SPEED, "driver": "someone"}, index=index.rename("Time"))
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize("version", ["v7", pytest.param("v7.3", marks=pytest.mark.slow)])
 def test_a_timetable_has_its_own_time(tmp_path: Path, version: str) -> None:
     file = written(tmp_path / "drive.mat", version, drive=timetable())
@@ -48,6 +49,7 @@ def test_a_timetable_has_its_own_time(tmp_path: Path, version: str) -> None:
     assert np.array_equal(log.speed, SPEED)
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize("version", ["v7", pytest.param("v7.3", marks=pytest.mark.slow)])
 def test_a_table_has_the_time_among_its_columns_beside_what_is_no_table(tmp_path: Path, version: str) -> None:
     table = pd.DataFrame({"time": TIME, "accel_cmd": COMMAND})
