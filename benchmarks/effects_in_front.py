@@ -1,5 +1,9 @@
 """Effects put in front of a recording: what the budget says of each, and the counts over all of them.
 
+A recording shows an effect that it excites: at the size put in, the effect changes what the best set of the untouched
+recording predicts by more than that set's parameters can follow. Half the square of the rest, in units of the noise, is
+what it can gain [nats] (Kay 1998, section 13.7); below `EFFECT_NATS` no diagnosis could name it.
+
 The untouched recording has a gap of its own, so a size is compared twice: on top of what the untouched recording's
 answer has of the effect; and "beside the same effects", on top of what the untouched recording has of it where the
 effects of the changed recording's answer are fitted. What a car has of an effect may be too little to be named.
@@ -7,6 +11,7 @@ effects of the changed recording's answer are fitted. What a car has of an effec
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -20,10 +25,15 @@ from avtorch.gap.engine.coordinates import base_name
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import fit
 from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.inference import infer
+from avtorch.gap.engine.likelihood import whiten
+from avtorch.gap.engine.priors import EFFECT_NATS
+from avtorch.gap.engine.promises import Projection
 from avtorch.gap.engine.recorder import base_fit
 from avtorch.gap.engine.sample import sample
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.budget import Budget, Part
+from avtorch.gap.sensor_noise import with_sensor_noise
 from avtorch.io import Log
 from benchmarks.blindtest import IN_FRONT, put_in_front
 from benchmarks.blindtest.parameter_score import SIZE_OF, SIZE_WITHIN
@@ -31,6 +41,7 @@ from benchmarks.budget_cells import causes, counted
 
 _COLUMNS = (
     "effect",
+    "excited [nats]",
     "",
     "size",
     "interval holds",
@@ -58,13 +69,15 @@ class Size:
 class InFront:
     """What is said of a recording with `effect` in front of it.
 
-    `named`: the verdict holds it; `alias`: it holds what these drives cannot tell from it. `size`, `same`: None where
-    it is not named. `others`: names that neither the effect nor the untouched recording accounts for; `nothing`:
-    whether the verdict is `none` or `unknown`.
+    `excited`: the nats that it can gain there, not known of what chance decides. `named`: the verdict holds it;
+    `alias`: it holds what these drives cannot tell from it. `size`, `same`: None where it is not named.
+    `others`: names that neither the effect nor the untouched recording accounts for; `nothing`: whether the verdict is
+    `none` or `unknown`.
     """
 
     effect: str
     put_in: Mapping[str, float]
+    excited: float
     named: bool
     alias: bool
     size: Size | None
@@ -78,7 +91,9 @@ class InFront:
         truth = ", ".join(f"{value:.3g}" for value in self.put_in.values())
         sizes = [cell for size in (self.size, self.same) for cell in _cells(size)]
         found = "named" if self.named else "alias" if self.alias else "missed"
-        return f"| {self.effect} ({truth}) | {found} | {' | '.join(sizes)} | {', '.join(self.others)} | {self.budget} |"
+        nats = "" if math.isnan(self.excited) else f"{self.excited:.0f}"
+        rest = " | ".join((found, *sizes, ", ".join(self.others), self.budget))
+        return f"| {self.effect} ({truth}) | {nats} | {rest} |"
 
 
 def _cells(size: Size | None) -> tuple[str, str]:
@@ -86,17 +101,18 @@ def _cells(size: Size | None) -> tuple[str, str]:
 
 
 def closing(rows: Sequence[InFront]) -> list[str]:
-    """The counts over all rows, with Wilson's 90 % intervals."""
+    """The counts over all rows, with Wilson's 90 % intervals; names also over what the recording excites."""
 
     def of_all(hits: Sequence[bool]) -> str:
         return counted(sum(hits), len(hits))
 
     sizes, same = [row.size for row in rows if row.size], [row.same for row in rows if row.same]
     named, alike = [row.named for row in rows], [row.named or row.alias for row in rows]
+    seen = [row.named for row in rows if not row.excited <= EFFECT_NATS]
     others = [bool(row.others) for row in rows]
     return [
-        f"named {of_all(named)}, with aliases {of_all(alike)}; with others {of_all(others)}; "
-        f"none or unknown {of_all([row.nothing for row in rows])}",
+        f"named {of_all(named)}, of what it excites {of_all(seen)}, with aliases {of_all(alike)}; "
+        f"with others {of_all(others)}; none or unknown {of_all([row.nothing for row in rows])}",
         f"sizes within {100 * SIZE_WITHIN:.0f} % {of_all([size.right for size in sizes])}, "
         f"beside the same effects {of_all([size.right for size in same])}",
         f"intervals that hold {of_all([size.holds for size in sizes])}, "
@@ -113,28 +129,29 @@ def budget_of(log: Log) -> Budget:
 
 
 def in_front(log: Log, size: float) -> None:
-    """Prints a row per effect that no chance decides, and the counts."""
+    """Prints a row per effect, and the counts. What chance decides has no size."""
     control, alone = budget_of(log), base_fit(DriveData.of(log))
-    print(f"{HEADER}\n| untouched | | | | | | | {causes(control)} |", flush=True)
+    print(f"{HEADER}\n| untouched | | | | | | | | {causes(control)} |", flush=True)
     T_L, K_L = alone["T_L"], alone["K_L"]
+    visited = infer(DriveData.of(with_sensor_noise(log)[0])).search.visited.values()
+    best = max(visited, key=lambda h: h.score)
     rows: list[InFront] = []
     for number, effect in enumerate(IN_FRONT):
-        if EFFECTS[effect].random:
-            continue
         try:
             changed, put_in = put_in_front(log, effect, T_L=T_L, K_L=K_L, size=size, seed=number)
             budget = budget_of(changed)
         except InputError:
             continue
-        before = size_of(control, effect)
-        own = _beside_the_same(budget, alone, effect, changed.epoch_s)
+        before, sized = size_of(control, effect), not EFFECTS[effect].random
+        own = _beside_the_same(budget, alone, effect, changed.epoch_s) if sized else None
         rows.append(
             InFront(
                 effect,
                 put_in,
+                excited(best, effect, put_in),
                 named=effect in budget.names,
                 alias=any(effect in x.alias_set for x in (*budget.parts, *budget.chance) if x.name in budget.names),
-                size=compared(budget, effect, put_in, None if before is None else before.mean),
+                size=compared(budget, effect, put_in, None if before is None else before.mean) if sized else None,
                 same=None if own is None else compared(budget, effect, put_in, own),
                 others=tuple(name for name in budget.names if name != effect and name not in control.names),
                 nothing=not budget.names,
@@ -143,6 +160,22 @@ def in_front(log: Log, size: float) -> None:
         )
         print(rows[-1], flush=True)
     print("\n".join(closing(rows)), flush=True)
+
+
+def excited(h: Hypothesis, effect: str, put_in: Mapping[str, float]) -> float:
+    """What the effect can gain beside the hypothesis [nats], at the values put in on top of those that it has."""
+    if effect not in TRIED:
+        return math.nan
+    own = TRIED[next((e for e in h.effects if base_name(e) == effect), effect)]
+    at = [h[c.name] if own.name in h.effects else 0.0 for c in own.coordinates]
+    at = [
+        x + c.coordinate(put_in[c.parameter]) if c.parameter in put_in else x or start
+        for x, c, start in zip(at, own.coordinates, (own.starts or ((0.0, 0.0),))[0], strict=True)
+    ]
+    beside = h.without(own.name) if own.name in h.effects else h
+    beside = beside.with_effect(own.name, at, h.onsets.get(own.name, put_in.get("change_s")))
+    left = Projection(h)(whiten(h.data, h.covariance, beside.response() - h.predicted))
+    return 0.5 * float(left @ left)
 
 
 def compared(budget: Budget, effect: str, put_in: Mapping[str, float], before: float | None) -> Size | None:

@@ -23,10 +23,10 @@ def made(*parts: Part, chance: tuple[ChancePart, ...] = (), T_L: float = 0.3, K_
     return Budget(2.0, 1.0, {}, parts, unexplained, repaired, chance)
 
 
-def part(name: str, probability: float = 0.9, /, **sizes: tuple[float, float, float]) -> Part:
+def part(name: str, **sizes: tuple[float, float, float]) -> Part:
     """A part with these parameters, each as mean and ends of its interval."""
     told = {key: Quantity(mean, 0.1, low, high) for key, (mean, low, high) in sizes.items()}
-    return Part(name, (name,), probability, HALF, 1.0, told)
+    return Part(name, (name,), 0.9, HALF, 1.0, told)
 
 
 def test_a_size_is_what_comes_on_top_of_the_untouched_recordings() -> None:
@@ -63,14 +63,12 @@ def test_an_interval_that_reaches_a_factor_of_nothing_holds_nothing() -> None:
 
 
 def test_what_is_not_named_has_no_size() -> None:
-    unsure = made(part("dead_time", 0.4, delay_s=(0.3, 0.2, 0.4)))
-    assert compared(unsure, "dead_time", {"delay_s": 0.3}, None) is None
     assert compared(made(), "dead_time", {"delay_s": 0.3}, None) is None
 
 
 def row(effect: str, **said: Any) -> InFront:
     given: dict[str, Any] = {"put_in": {"delay_s": 0.24}, "named": False, "alias": False, "size": None, "same": None}
-    given |= {"others": (), "nothing": False, "budget": "none"}
+    given |= {"others": (), "nothing": False, "budget": "none", "excited": 30.0}
     return InFront(effect, **(given | said))
 
 
@@ -78,11 +76,12 @@ def test_the_closing_lines_count_with_intervals() -> None:
     rows = [
         row("dead_time", named=True, size=Size(1.3, False), same=Size(1.0, True)),
         row("dead_band", named=True, size=Size(0.9, True), same=Size(0.8, False), others=("gust",)),
-        row("road_grade", alias=True, others=("gust",)),
-        row("saturation", nothing=True),
+        row("road_grade", alias=True, others=("gust",), excited=float("nan")),
+        row("saturation", nothing=True, excited=4.0),
     ]
     assert closing(rows) == [
-        "named 2 of 4 (18 to 82 %), with aliases 3 of 4 (36 to 94 %); with others 2 of 4 (18 to 82 %); "
+        "named 2 of 4 (18 to 82 %), of what it excites 2 of 3 (25 to 92 %), with aliases 3 of 4 (36 to 94 %); "
+        "with others 2 of 4 (18 to 82 %); "
         "none or unknown 1 of 4 (6 to 64 %)",
         "sizes within 25 % 1 of 2 (12 to 88 %), beside the same effects 2 of 2 (43 to 100 %)",
         "intervals that hold 1 of 2 (12 to 88 %), beside the same effects 1 of 2 (12 to 88 %)",
@@ -92,13 +91,13 @@ def test_the_closing_lines_count_with_intervals() -> None:
 
 def test_a_row_has_a_cell_for_each_column() -> None:
     whole = row("dead_time", named=True, size=Size(1.3, False), same=Size(1.0, True), budget="dead_time 100%: 0.3")
-    assert str(whole) == ("| dead_time (0.24) | named | 1.30 | no | 1.00 | yes |  | dead_time 100%: 0.3 |")
+    assert str(whole) == ("| dead_time (0.24) | 30 | named | 1.30 | no | 1.00 | yes |  | dead_time 100%: 0.3 |")
     width = HEADER.splitlines()[0].count("|")
     assert str(whole).count("|") == str(row("saturation")).count("|") == width
 
 
 def test_causes_are_told_with_shares_and_intervals() -> None:
-    found = made(part("dead_time", delay_s=(0.3, 0.25, 0.35)), part("backlash", 0.2), chance=(ChancePart("gust", 0.8),))
+    found = made(part("dead_time", delay_s=(0.3, 0.25, 0.35)), chance=(ChancePart("gust", 0.8),))
     assert causes(found) == "dead_time 50%: 0.3 (0.25 to 0.35); gust, by chance"
     assert causes(made()) == "none"
 
@@ -112,5 +111,6 @@ def test_a_log_is_answered_with_an_effect_in_front_of_it(
     untouched, row, *counts = capsys.readouterr().out.splitlines()[2:]
     assert untouched.startswith("| untouched |")
     assert row.startswith("| sensor_bias (")
-    assert row.split("|")[2].strip() == "named"
+    assert float(row.split("|")[2]) > 100.0  # a quarter of the reading's spread, for a minute
+    assert row.split("|")[3].strip() == "named"
     assert counts[0].startswith("named 1 of 1")

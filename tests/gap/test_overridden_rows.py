@@ -95,14 +95,3 @@ def test_where_nothing_is_left_the_error_names_it(driven: slice) -> None:
         InputError, match=r"drive: 0\.\d s of driving in one stretch \(moving, engaged\), needs 12 s or more"
     ):
         CountedRows.of(replace(log, engaged=engaged))
-
-
-def test_a_car_that_stands_for_a_moment_has_stopped() -> None:
-    """For 0.2 s at 50 Hz: what it does on either side is compared, and nothing of what it was asked for while it
-    stood."""
-    time = np.arange(0.0, 60.0, 0.02)
-    speed = np.clip(np.abs(time - 30.0) * 2.5 - 0.25, 0.0, 25.0)
-    log = Log.from_arrays(time=time, accel_cmd=np.gradient(speed, time), speed=speed)
-    data = DriveData.of(log)
-    assert len(data.bounds) == 3
-    assert np.interp(data.time, time, speed).min() > 0.2  # 0.3, but for what a smoothed corner is late

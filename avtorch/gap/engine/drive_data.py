@@ -31,7 +31,6 @@ UNKNOWN_SPEED_MPS = 15.0
 """What effects read where no speed was measured [m/s]."""
 _MOST_HZ = 100.0  # rows of faster logs are averaged: nothing above half of it is a car's
 _SMOOTH_S = 0.3  # the speed enters effects smoothed over it
-_STOP_S = 0.1  # a car that stands for longer has stopped; over it the noise of a speed is none
 _START_S = 0.6  # over which the first acceleration is averaged
 _LEAST_COEFFICIENTS = 6  # of a band, in each channel
 _FRAMES = 30  # of a drive, within the limits of their length
@@ -481,7 +480,7 @@ def _stretches(log: Log) -> list[slice]:
     for part in log.engaged_segments():
         moves = log.moving[part]
         if log.speed is not None:
-            smooth = gaussian_filter1d(log.speed[part], _STOP_S * log.rate_hz, mode="nearest")
+            smooth = gaussian_filter1d(log.speed[part], _SMOOTH_S * log.rate_hz, mode="nearest")
             moves = smooth > log.standstill_mps
         change = np.flatnonzero(np.diff(moves.astype(int), prepend=0, append=0)).tolist()
         out += [slice(part.start + i, part.start + j) for i, j in zip(change[::2], change[1::2], strict=True)]

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.engine.coordinates import COORDINATES, EFFECTS, INDEX
+from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.gauss_newton import linear_priors, normal_prior, slopes_of, whitened_under_noise
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import HALF_LOG_2PI, claimed, freedom, log_sum
@@ -106,9 +107,19 @@ def _student(z: Tensor) -> Tensor:
     return _STUDENT_3 - 2 * torch.log1p(z * z / 3)
 
 
+def onset_nats(data: DriveData) -> float:
+    """What it costs an effect to set in at a moment of its own and not to act throughout [nats]: a moment is one of as
+    many as there are frames."""
+    return _moment_nats(data) + math.log((1 - ONSET_ODDS) / ONSET_ODDS)
+
+
+def _moment_nats(data: DriveData) -> float:
+    return math.log(max(data.frame_count, 4))
+
+
 def _onset_odds(h: Hypothesis) -> float:
-    """A moment is one of as many as there are frames; several effects may set in at it."""
-    total = -len(set(h.onsets.values())) * math.log(max(h.data.frame_count, 4))
+    """Several effects may set in at one moment."""
+    total = -len(set(h.onsets.values())) * _moment_nats(h.data)
     for e in h.effects:
         when = EFFECTS[e].onset
         if e in h.onsets:

@@ -15,6 +15,7 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import INDEX, EngineEffect
 from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.evidence import onset_nats
 from avtorch.gap.engine.gauss_newton import linearised, normal_prior, whitened_jacobian
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import least_noise, log_likelihood, whiten
@@ -234,7 +235,7 @@ def _onsets(
         before = data.frame_time[frame - 1] if frame else data.time[0]
         near = inside & (data.time > before - data.hop_s) & (data.time < data.frame_time[frame] + data.hop_s)
         rows = {int(np.where(near, priced, 0.0).argmax()), *np.flatnonzero(near & data.starts)}
-        tried += [(float(data.time[row]), 3.0) for row in sorted(rows) if near[row]]
+        tried += [(float(data.time[row]), onset_nats(data)) for row in sorted(rows) if near[row]]
         frames[np.abs(data.frame_time - data.frame_time[frame]) < 1.5 * data.hop_s] = 0
     out = []
     for onset, price in tried:
