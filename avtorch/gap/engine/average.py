@@ -26,9 +26,9 @@ from avtorch.gap.engine.coordinates import EFFECTS, INDEX, base_name
 from avtorch.gap.engine.family import family_of
 from avtorch.gap.engine.free_forms import (
     FreeFormFit,
-    block,
-    block_or_late,
-    families,
+    explained,
+    explained_or_late,
+    linear_forms,
     mirror_columns,
     sensor_form,
     wandering,
@@ -202,13 +202,13 @@ def examine(h: Hypothesis, search: Search) -> Examined:
 def _free_forms(h: Hypothesis, search: Search) -> tuple[dict[str, FreeFormFit], float]:
     """Each free form beside a hypothesis, and the nats of the mirrored linear bank."""
     # where bases have a map, it is there that a map stands beside these effects
-    others = {name: form for name, form in families(h).items() if name != "map" or not search.map_bases}
-    forms = {name: block(h, form) for name, form in others.items()}
+    others = {name: form for name, form in linear_forms(h).items() if name != "map" or not search.map_bases}
+    forms = {name: explained(h, form) for name, form in others.items()}
     mirror = 0.0
     if forms["linear"].nats > 0 or _LINEAR & set(h.names):
-        mirror = max(block(h, mirror_columns(h)).nats, 0.0)
+        mirror = max(explained(h, mirror_columns(h)).nats, 0.0)
         forms["linear"] = forms["linear"]._replace(nats=forms["linear"].nats - mirror)
-    return forms | wandering(h) | {"sensor": block_or_late(h, sensor_form(h))}, mirror
+    return forms | wandering(h) | {"sensor": explained_or_late(h, sensor_form(h))}, mirror
 
 
 def free_form_response(x: Examined, search: Search, form: str) -> FloatArray | None:
@@ -374,6 +374,8 @@ def _set_in(c: Composition, late: Mapping[str, SlowOnset]) -> Composition:
 
 
 def _weights(x: Examined, examined: list[Examined]) -> Iterator[Weight]:
+    """A weight for every label that the evidence of a set supports: its names with each slow force, with and without
+    outliers, some of them as errors of the others' shape, and `unknown` (None as names) where a free form is there."""
     h = x.hypothesis
     named = [e for e in h.effects if not e.startswith("~")]
     names, count = sorted({base_name(e) for e in named}), len(named)

@@ -1,7 +1,10 @@
 """The evidence of a hypothesis, by Laplace's approximation.
 
-    log E = min(gain below 10 Hz, gain of the whole band) + log integral over errors of shape + log prior
-            + d/2 log 2 pi - 1/2 log det H
+    log E = min(gain below 10 Hz, gain of all bands) + log integral over errors of shape + log prior
+            + d/2 log 2 pi - 1/2 log det H + log odds
+
+The odds are those of onsets, of stretches of lost messages, of speeds at which gears shift, and the density of a force
+map. A search compares sets by their `score`: the evidence less what one more effect has to gain.
 
 Gains are over the base, the hypothesis without effects and without a force map. Sizes have a heavy-tailed prior
 (Student, three degrees of freedom) that vanishes where an effect would make no difference (non-local; Johnson and

@@ -14,7 +14,7 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.evidence import evaluate_evidence
 from avtorch.gap.engine.force_map import MAP_SIZES, MapForm, map_forms, size_log_prior
-from avtorch.gap.engine.free_forms import band_products, block, linear_evidence, map_free_form
+from avtorch.gap.engine.free_forms import band_products, explained, linear_evidence, map_free_form
 from avtorch.gap.engine.gauss_newton import fit, linearised, objective
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import log_sum
@@ -42,7 +42,7 @@ def prices(h: Hypothesis) -> list[Price]:
         return []
     out = []
     for form in map_forms(h.data):
-        found = block(h, map_free_form(h, form))
+        found = explained(h, map_free_form(h, form))
         out.append(Price(form.of_size(found.size), found.nats - UNKNOWN_NATS))
     return out
 

@@ -81,7 +81,7 @@ class FreeFormFit(NamedTuple):
     size: float = COEFFICIENT_SD
 
 
-def families(h: Hypothesis) -> dict[str, FreeForm]:
+def linear_forms(h: Hypothesis) -> dict[str, FreeForm]:
     """The free forms of dynamics ("linear", "sided") and of the force ("map", where the speed is known and the base has
     no map of its own)."""
     u = h["K_L"] * h.command()
@@ -123,7 +123,7 @@ def mirror_columns(h: Hypothesis) -> FreeForm:
     return FreeForm("mirror", demand_response(h, demands, lags, backwards=True))
 
 
-def block(h: Hypothesis, form: FreeForm) -> FreeFormFit:
+def explained(h: Hypothesis, form: FreeForm) -> FreeFormFit:
     """Evidence of a linear form beside `h`, whose parameters may move again, summed over the form's sizes.
 
     `h`: with its evidence evaluated (`information`).
@@ -153,12 +153,12 @@ def block(h: Hypothesis, form: FreeForm) -> FreeFormFit:
     return FreeFormFit(log_sum(nats) - over, residual, best[known:], size)
 
 
-def block_or_late(h: Hypothesis, form: FreeForm) -> FreeFormFit:
+def explained_or_late(h: Hypothesis, form: FreeForm) -> FreeFormFit:
     """Evidence of a linear form that acts throughout, or from one of `ONSET_SHARES` of the frames on."""
-    frames, fits = h.data.frame_count, [block(h, form)]
+    frames, fits = h.data.frame_count, [explained(h, form)]
     for share in ONSET_SHARES:
         later = np.arange(frames)[:, None] >= share * frames
-        fit = block(h, replace(form, columns=form.columns * later))
+        fit = explained(h, replace(form, columns=form.columns * later))
         fits.append(fit._replace(nats=fit.nats + math.log(ONSET_ODDS / len(ONSET_SHARES))))
     return max(fits, key=lambda fit: fit.nats)
 

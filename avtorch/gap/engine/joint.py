@@ -29,7 +29,7 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.engine.coordinates import COORDINATES, INDEX, Coordinate, EngineEffect
 from avtorch.gap.engine.drive_data import DriveData
-from avtorch.gap.engine.free_forms import COEFFICIENT_SD, band_products, demand_response, families, gram
+from avtorch.gap.engine.free_forms import COEFFICIENT_SD, band_products, demand_response, gram, linear_forms
 from avtorch.gap.engine.gauss_newton import jacobian, normal_prior
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.inference import cleaned_drives
@@ -254,7 +254,7 @@ class JointModel:
         """Columns of all families on each side: dynamics, force map, forces by speed, faults of the accelerometer."""
         h = Hypothesis(self.whole, values=fit.sides[0].values.copy(), neutral=self.base.neutral).evaluate()
         data = self.whole
-        forms = [form.columns for form in families(h).values()]
+        forms = [form.columns for form in linear_forms(h).values()]
         v = (data.smooth_speed - data.smooth_speed.mean()) / max(float(data.smooth_speed.std()), 0.1)
         forces = np.array([np.ones_like(v), v, v * v] if data.speed is not None else [np.ones_like(v)])
         forms.append(demand_response(h, forces, np.full(len(forces), 1e-3)))

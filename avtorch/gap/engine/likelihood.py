@@ -4,10 +4,10 @@ In band b with n_b coefficients a channel, covariance free, Jeffreys' prior:
 
     log L = -1/2 sum_b n_b log det E_b,   E_b = 1/n_b sum R R'        (a multivariate Student; Gelman et al. 2013, 3.6)
 
-There is no fit of the noise: the spectrum is estimated anew with every hypothesis, and a slow error of few coefficients
-cannot gain more than `n_b log`. The whole band is fitted, the band below 10 Hz may claim: in a closed loop the command
-answers the noise, and the cross terms cancel over all frequencies only (prediction-error identification; Ljung 1999,
-13).
+There is no fit of the noise: each hypothesis has its own spectrum, and removing a slow error of few coefficients gains
+only logarithmically. A fit looks at all bands, and no hypothesis gains more than in those below 10 Hz (`claimed`): in a
+closed loop the command answers the noise, and the cross terms cancel over all frequencies only (prediction-error
+identification; Ljung 1999, 13).
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ def band_covariance(data: DriveData, residual: FloatArray) -> FloatArray:
 
 
 def log_likelihood(data: DriveData, residual: FloatArray, spread: FloatArray | None = None) -> tuple[float, FloatArray]:
-    """Nats of the whole band, and the noise's covariance (band, channel, channel) at its maximum.
+    """Log likelihood of all bands [nats], the noise's covariance integrated out, up to a constant; and where that
+    covariance (band, channel, channel) is likeliest.
 
     `spread` (band, channel, channel): mean square of what coefficients that are integrated out may still be wrong by in
     the residual; restricted maximum likelihood (Harville 1977) adds it to the noise, so that many coefficients cannot

@@ -46,10 +46,10 @@ _MOST_ALIASES = 6
 
 @dataclass(frozen=True)
 class Candidate:
-    """A hypothesis: `"none"`, `"unknown"`, an effect, or two (`"a+b"`, in alphabetical order).
+    """A hypothesis: `"none"`, `"unknown"`, an effect, or several (`"a+b"`, in alphabetical order).
 
     `log_evidence` [nats] relative to `none`, without the prior over causes; None for `unknown`. `parameters` by the
-    table's names, those of a pair as `effect.parameter`; `moved`: the baseline's `T_L` [s] and `K_L` [-] under this
+    table's names, those of several as `effect.parameter`; `moved`: the baseline's `T_L` [s] and `K_L` [-] under this
     hypothesis. `onset_s` on the log's own clock; None where the effect acts from the start. `implausible`: a sentence
     for each parameter outside its physically possible range (`implausible`).
     """
@@ -195,9 +195,11 @@ def _rate_onset(h: Hypothesis, rows: Sequence[int]) -> float | None:
 
 
 def verdict_names(average: ModelAverage) -> tuple[str, ...]:
-    """Causes of the most probable hypothesis that, they or their aliases, are there with a probability of a half or
-    more, and others of which that holds by themselves, beside those that they could stand in for, the likeliest first;
-    `("none",)` or `("unknown",)`, the more probable, where there are none."""
+    """Causes that are there with a probability of a half or more, the likeliest first; where there are none,
+    `("none",)` or `("unknown",)`, the more probable.
+
+    A cause of the most probable hypothesis counts together with its aliases; any other one only in sets that also hold
+    the causes for which it could stand in."""
     names = {n for label in average.probabilities for n in label.split("+")} - set(ALWAYS)
     own = set(average.label.split("+")) - set(ALWAYS)
     stands_for = {n: {m for m in own if n in aliases_of(average, m)} - {n} for n in names}

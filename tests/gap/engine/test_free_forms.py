@@ -22,11 +22,11 @@ from avtorch.gap.engine.free_forms import (
     _first_order_backwards,
     _moved,
     band_products,
-    block,
-    block_or_late,
     demand_response,
-    families,
+    explained,
+    explained_or_late,
     first_order,
+    linear_forms,
     mirror_columns,
     sensor_form,
     wandering,
@@ -180,10 +180,10 @@ def test_band_products_give_every_whitened_product(fresh_seed: int) -> None:
 def test_evidence_does_not_depend_on_the_basis(fresh_seed: int) -> None:
     """A rotation of a form's coefficients leaves their prior as it is, and so their evidence."""
     h = _car(_cubic)
-    form = families(h)["sided"]
+    form = linear_forms(h)["sided"]
     rotation = np.linalg.qr(np.random.default_rng(fresh_seed).normal(size=(len(form.columns),) * 2))[0]
     turned = FreeForm("sided", np.tensordot(rotation, form.columns, 1))
-    one, other = block(h, form), block(h, turned)
+    one, other = explained(h, form), explained(h, turned)
     assert other.nats == pytest.approx(one.nats, abs=1e-6)
     np.testing.assert_allclose(other.coefficients, rotation @ one.coefficients, atol=1e-6)
 
@@ -193,18 +193,18 @@ def test_what_the_parameters_already_do_gains_nothing() -> None:
     is 0.5; with another 0.35 beside it, the prior is wider, and the posterior as narrow."""
     h = _car(_lags)
     again = FreeForm("gain", slopes_of(h)[h.free.index("K_L")][None])
-    found = block(h, again)
+    found = explained(h, again)
     wider = 0.5 * math.log(1.0 + (0.35 / 0.5) ** 2)
     assert found.nats == pytest.approx(-wider, abs=0.2)  # what the prior's mean is away from the fit
 
 
 def test_residual_is_what_the_coefficients_leave() -> None:
     h = _car(_cubic)
-    form = families(h)["map"]
-    found = block(h, form)
+    form = linear_forms(h)["map"]
+    found = explained(h, form)
     assert found.residual is not None
-    explained = h.residual - found.residual - np.tensordot(found.coefficients, form.columns, 1)
-    flat = explained.ravel()
+    rest = h.residual - found.residual - np.tensordot(found.coefficients, form.columns, 1)
+    flat = rest.ravel()
     basis = slopes_of(h).reshape(len(h.free), -1)
     left = flat - basis.T @ np.linalg.lstsq(basis.T, flat, rcond=None)[0]
     assert np.linalg.norm(left) < 1e-6 * np.linalg.norm(flat)
@@ -218,8 +218,8 @@ def test_what_dynamics_leave_is_left_by_a_car_within_its_limits() -> None:
     assert there["T_L"] == h.limits("T_L")[0]
     np.testing.assert_allclose([there[n] - h[n] for n in h.free if n != "T_L"], 0.01)
     np.testing.assert_allclose(there.residual, h.data.measured - there.response())
-    form = families(h)["linear"]
-    found = block(h, form)
+    form = linear_forms(h)["linear"]
+    found = explained(h, form)
     assert found.residual is not None
     left = log_likelihood(h.data, found.residual)[0] - h.log_likelihood
     assert found.nats <= left - 0.5 * float(found.coefficients @ found.coefficients) / COEFFICIENT_SD**2 + 1e-6
@@ -253,12 +253,12 @@ def test_a_frame_that_is_late_is_simulated_so() -> None:
 def test_nothing_is_found_where_nothing_is_missing(channels: tuple[str, ...]) -> None:
     """Every coefficient that could be seen and is not there costs its logarithm of how well it was seen."""
     h = _car(_lags, channels)
-    forms = families(h)
+    forms = linear_forms(h)
     assert set(forms) == ({"linear", "sided", "map"} if "speed" in channels else {"linear", "sided"})
-    fits = [block(h, f) for f in [*forms.values(), mirror_columns(h)]]
+    fits = [explained(h, f) for f in [*forms.values(), mirror_columns(h)]]
     fits += wandering(h).values()
     if len(channels) == 2:
-        fits += [block_or_late(h, sensor_form(h)), *(roughness(h, form) for form in SIGNS)]
+        fits += [explained_or_late(h, sensor_form(h)), *(roughness(h, form) for form in SIGNS)]
     assert max(f.nats for f in fits) < 0.0
 
 
@@ -270,7 +270,7 @@ def test_nothing_is_found_where_nothing_is_missing(channels: tuple[str, ...]) ->
 def test_the_family_of_the_cause_gains_most(response: Force, family: str) -> None:
     """The gain of one side is a map, its lag is not. Gains are hundreds of nats."""
     h = _car(response)
-    nats = {name: block(h, form).nats for name, form in families(h).items()}
+    nats = {name: explained(h, form).nats for name, form in linear_forms(h).items()}
     nats |= {name: found.nats for name, found in wandering(h).items()}
     assert max(nats, key=lambda name: nats[name]) == family
     assert nats[family] > 20.0
@@ -294,12 +294,12 @@ def test_dynamics_of_one_reading_are_the_sensors() -> None:
     """A recorder's filter is below 50 ms; both channels of the car share its own lag."""
     data = _car(_lags).data
     h = _fitted(data.with_accel(_lagged(data.accel)))
-    assert block(h, sensor_form(h)).nats > block(h, families(h)["linear"]).nats + 20.0
+    assert explained(h, sensor_form(h)).nats > explained(h, linear_forms(h)["linear"]).nats + 20.0
 
 
 def test_an_answer_before_the_command_is_the_mirrors() -> None:
     h = _car(_foreseeing)
-    assert block(h, mirror_columns(h)).nats > block(h, families(h)["linear"]).nats + 20.0
+    assert explained(h, mirror_columns(h)).nats > explained(h, linear_forms(h)["linear"]).nats + 20.0
 
 
 @pytest.mark.parametrize(
