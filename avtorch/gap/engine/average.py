@@ -208,6 +208,9 @@ def _free_forms(h: Hypothesis, search: Search) -> tuple[dict[str, FreeFormFit], 
     if forms["linear"].nats > 0 or _LINEAR & set(h.names):
         mirror = max(explained(h, mirror_columns(h)).nats, 0.0)
         forms["linear"] = forms["linear"]._replace(nats=forms["linear"].nats - mirror)
+    if forms["sided"].nats > 0:
+        echo = max(explained(h, mirror_columns(h, "sided")).nats, 0.0)
+        forms["sided"] = forms["sided"]._replace(nats=forms["sided"].nats - echo)
     return forms | wandering(h) | {"sensor": explained_or_late(h, sensor_form(h))}, mirror
 
 

@@ -9,8 +9,8 @@ lags of one reading (sensor). The noise's covariance stays free in every band, a
 integrated out by Laplace's approximation. A form's gain is the lesser of that below `claim_hz` and that of all bands,
 as everywhere: a closed loop's echoes cancel over the whole band only (Ljung 1999, section 13.4).
 
-The mirrored bank, whose lags run backwards in time, is a negative control for linear dynamics: no car answers before
-the command, but a loop that answers the noise of sensors does, as a recorder shows it (negative
+The mirrored banks, whose lags run backwards in time, are negative controls for dynamics: no car answers before the
+command, but a loop that answers the noise of sensors does, as a recorder shows it (negative
 controls: Lipsitch, Tchetgen Tchetgen and Cohen 2010).
 """
 
@@ -116,10 +116,10 @@ def map_free_form(h: Hypothesis, form: MapForm) -> FreeForm:
     return FreeForm("map", columns, sizes)
 
 
-def mirror_columns(h: Hypothesis) -> FreeForm:
-    """The linear bank run backwards in time: the answer to a command before it was given."""
-    lags = np.array(_bank(h))
-    demands = np.tile(h["K_L"] * h.command(), (len(lags), 1))
+def mirror_columns(h: Hypothesis, form: str = "linear") -> FreeForm:
+    """The bank of a `form` ("linear", "sided") run backwards in time: the answer to a command before it was given."""
+    lags, u = np.array(_bank(h)), h["K_L"] * h.command()
+    demands = np.tile(np.maximum(u, 0.0) if form == "sided" else u, (len(lags), 1))
     return FreeForm("mirror", demand_response(h, demands, lags, backwards=True))
 
 

@@ -92,6 +92,11 @@ def _foreseeing(time: FloatArray, u: FloatArray) -> FloatArray:
     return 0.8 * _lagged(GAIN * u) + 0.2 * _lagged(GAIN * u[::-1])[::-1]
 
 
+def _foreseeing_drive(time: FloatArray, u: FloatArray) -> FloatArray:
+    up = np.maximum(u, 0.0)
+    return _lagged(GAIN * np.minimum(u, 0.0)) + 0.8 * _lagged(GAIN * up) + 0.2 * _lagged(GAIN * up[::-1])[::-1]
+
+
 @cache
 def _car(response: Force, channels: tuple[str, ...] = ("accel", "speed"), seed: int = 0) -> Hypothesis:
     """The hypothesis without effects, fitted to a car with this response to an open-loop command."""
@@ -297,9 +302,10 @@ def test_dynamics_of_one_reading_are_the_sensors() -> None:
     assert explained(h, sensor_form(h)).nats > explained(h, linear_forms(h)["linear"]).nats + 20.0
 
 
-def test_an_answer_before_the_command_is_the_mirrors() -> None:
-    h = _car(_foreseeing)
-    assert explained(h, mirror_columns(h)).nats > explained(h, linear_forms(h)["linear"]).nats + 20.0
+@pytest.mark.parametrize("form", ["linear", "sided"])
+def test_an_answer_before_the_command_is_the_mirrors(form: str) -> None:
+    h = _car(_foreseeing if form == "linear" else _foreseeing_drive)
+    assert explained(h, mirror_columns(h, form)).nats > explained(h, linear_forms(h)[form]).nats + 20.0
 
 
 @pytest.mark.parametrize(
