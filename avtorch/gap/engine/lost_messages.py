@@ -278,8 +278,8 @@ def _conditional_modes(
         while k < count:
             i, j = begin[k], end[k]
             _put(m, score, i, j, -1.0)
-            low = max(end[k - 1] + 1 if k > 0 else 1, i - m.longest)
-            high = min(begin[k + 1] - 1 if k + 1 < count else n, j + m.longest)
+            low = end[k - 1] + 1 if k > 0 else 1
+            high = begin[k + 1] - 1 if k + 1 < count else n
             a, b = _best_within(m, score, low, high)
             if b > 0:
                 _put(m, score, a, b, 1.0)
