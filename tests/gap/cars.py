@@ -46,6 +46,7 @@ def log_of(
         u = u - float(response.accel.mean()) / K_L
         speed = response.speed - response.speed[0] + 18.0
     response = car.response(SimulatorInput(torch.as_tensor(time), torch.as_tensor(u), speed, 0.0))
+    speed = response.speed - response.speed[0] + 18.0
     pole = np.exp(-dt / 1.5)
     force = np.asarray(lfilter([1.0], [1.0, -pole], rng.normal(0.0, 0.05 * np.sqrt(1 - pole**2), len(u))))
     ring = np.asarray(lfilter([1.0], [1.0, -1.2, 0.8], rng.normal(0.0, 0.03, len(u))))
