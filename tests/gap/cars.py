@@ -41,12 +41,11 @@ def log_of(
     time = np.arange(len(u)) * dt
     speed = torch.full((len(u),), 18.0, dtype=torch.float64)
     car = plant(effects, T_L=T_L, K_L=K_L)
-    for _ in range(4):  # speed decides on some effects, and they on speed; the driver makes up for what they take
+    for _ in range(10):  # speed decides on some effects, and they on speed; the driver makes up for what they take
         response = car.response(SimulatorInput(torch.as_tensor(time), torch.as_tensor(u), speed, 0.0))
         u = u - float(response.accel.mean()) / K_L
         speed = response.speed - response.speed[0] + 18.0
     response = car.response(SimulatorInput(torch.as_tensor(time), torch.as_tensor(u), speed, 0.0))
-    speed = response.speed - response.speed[0] + 18.0
     pole = np.exp(-dt / 1.5)
     force = np.asarray(lfilter([1.0], [1.0, -pole], rng.normal(0.0, 0.05 * np.sqrt(1 - pole**2), len(u))))
     ring = np.asarray(lfilter([1.0], [1.0, -1.2, 0.8], rng.normal(0.0, 0.03, len(u))))
