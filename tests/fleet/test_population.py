@@ -65,9 +65,9 @@ def test_without_a_second_drive_of_any_car_its_spread_is_not_told() -> None:
     assert common["T_L"]["between"]["q05"] > 0
 
 
-AXES = [torch.linspace(*ends, n, dtype=F64) for *ends, n in ((-0.8, 0.8, 61), (-5.0, 1.0, 50), (-7.0, 0.5, 45))]
+AXES = [torch.linspace(*ends, n, dtype=F64) for *ends, n in ((-0.8, 0.8, 61), (-5.0, 1.0, 50), (-7.0, 0.5, 90))]
 Z = torch.stack([x.flatten() for x in torch.meshgrid(*AXES, indexing="ij")], -1)
-"""Mean, log between and log within (point,)."""
+"""Mean, log between and log within (point,): a belief in the last, read from 45 points, is off by 0.004 of itself."""
 
 
 def joint(y: Tensor, sd: Tensor, car: Tensor) -> tuple[Tensor, Tensor]:
@@ -111,7 +111,7 @@ def test_the_belief_on_the_grid_is_that_of_the_model(rotating_seed: int) -> None
     spreads = found.spreads()
     told = [found.typical(), *(np.log([*spreads[name].values()]) for name in ("between", "within"))]
     for i, (axis, ends) in enumerate(zip(AXES, told, strict=True)):
-        own = weight.reshape(61, 50, 45).sum([k for k in range(3) if k != i])
+        own = weight.reshape(61, 50, 90).sum([k for k in range(3) if k != i])
         below = np.interp(ends, axis, own.cumsum(0) - 0.5 * own)
         assert below == pytest.approx([0.5, 0.05, 0.95], abs=0.01)
     # each car by the normal law of all drives and itself
