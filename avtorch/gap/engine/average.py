@@ -384,10 +384,8 @@ def _weights(x: Examined, examined: list[Examined]) -> Iterator[Weight]:
     names, count = sorted({base_name(e) for e in named}), len(named)
     each = EFFECT_NATS_ALONE if h.alone else EFFECT_NATS
     odds = -each * count - (UNKNOWN_NATS if h.force is not None else 0.0)
-    # outliers that other sets explain are none: more effects may not make more of them
-    spikes = [
-        y.outliers.nats for y in examined if y.outliers is not None and set(y.hypothesis.effects) <= set(h.effects)
-    ]
+    # outliers that another set explains are none, and no set may gain by making more of them
+    spikes = [y.outliers.nats for y in examined if y.outliers is not None]
     spike = min(spikes) if spikes else -np.inf
     for c in x.compositions:
         labels: list[tuple[list[str] | None, float]] = [(names, 0.0)]
