@@ -23,6 +23,7 @@ from tests.bars import BAR, log_odds
 
 RATE_HZ = 50
 NOISE_MPS2 = 0.05
+ROWS = 120 * RATE_HZ
 DYNAMICS = np.array([1.0, -1.3, 0.6])
 """pi of the errors below: a resonance, whose energy 3.05 tells additive from innovational outliers."""
 
@@ -47,6 +48,13 @@ def _places(rng: np.random.Generator, first: int, last: int, count: int, apart: 
     """Rows (count,), rising, at least so far `apart`."""
     slack = last - first - apart * count
     return first + np.sort(rng.integers(0, slack, count)) + apart * np.arange(count)
+
+
+def _spikes(rng: np.random.Generator, size: float) -> tuple[FloatArray, np.ndarray]:
+    """Sixty outliers (row,) of this size in `ROWS`, and their places."""
+    places, spikes = _places(rng, 300, ROWS - 50, 60), np.zeros(ROWS)
+    spikes[places] = size * rng.choice([-1, 1], 60)
+    return spikes, places
 
 
 # innovations ----------------------------------------------------------------------------------------------------------
@@ -139,11 +147,8 @@ def test_each_law_is_told_by_its_own_draws(rotating_seed: int) -> None:
 @pytest.mark.statistical
 def test_outliers_are_flagged_and_replaced(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
-    rows = 120 * RATE_HZ
-    places = _places(rng, 300, rows - 50, 60)
-    noise = NOISE_MPS2 * rng.normal(size=rows)
-    spikes = np.zeros(rows)
-    spikes[places] = 12 * NOISE_MPS2 * rng.choice([-1, 1], 60)
+    noise = NOISE_MPS2 * rng.normal(size=ROWS)
+    spikes, places = _spikes(rng, 12 * NOISE_MPS2)
     data = _data(rng, 120.0, noise + spikes)
     found = sensor_outliers(Hypothesis(data))
     assert found.nats > log_odds()
@@ -165,13 +170,9 @@ def test_outliers_are_flagged_and_replaced(rotating_seed: int) -> None:
 def test_outliers_on_a_smooth_error_are_flagged(rotating_seed: int) -> None:
     """Six poles answer an outlier with seven large innovations in a row, longer than a lasting deviation: it is one."""
     rng = np.random.default_rng(rotating_seed)
-    rows, smooth = 120 * RATE_HZ, np.poly([0.8] * 6)
-    places = _places(rng, 300, rows - 50, 60)
-    noise = 0.1 * NOISE_MPS2 * lfilter([1.0], smooth, rng.normal(size=rows))
-    spikes = np.zeros(rows)
-    spikes[places] = 20 * NOISE_MPS2 * rng.choice([-1, 1], 60)
-    data = _data(rng, 120.0, noise + spikes)
-    found = sensor_outliers(Hypothesis(data))
+    noise = 0.1 * NOISE_MPS2 * lfilter([1.0], np.poly([0.8] * 6), rng.normal(size=ROWS))
+    spikes, places = _spikes(rng, 20 * NOISE_MPS2)
+    found = sensor_outliers(Hypothesis(_data(rng, 120.0, noise + spikes)))
     assert found.nats > log_odds()
     # each is 200 innovations' scales
     assert set(places) <= set(np.flatnonzero(found.flags))
