@@ -170,8 +170,8 @@ def test_outliers_are_flagged_and_replaced(rotating_seed: int) -> None:
 def test_outliers_on_a_smooth_error_are_flagged(rotating_seed: int) -> None:
     """Six poles answer an outlier with seven large innovations in a row, longer than a lasting deviation: it is one."""
     rng = np.random.default_rng(rotating_seed)
-    noise = 0.1 * NOISE_MPS2 * lfilter([1.0], np.poly([0.8] * 6), rng.normal(size=ROWS))
-    spikes, places = _spikes(rng, 20 * NOISE_MPS2)
+    noise = 0.01 * NOISE_MPS2 * lfilter([1.0], np.poly([0.8] * 6), rng.normal(size=ROWS))
+    spikes, places = _spikes(rng, 2 * NOISE_MPS2)
     found = sensor_outliers(Hypothesis(_data(rng, 120.0, noise + spikes)))
     assert found.nats > log_odds()
     # each is 200 innovations' scales
