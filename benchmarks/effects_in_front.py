@@ -2,7 +2,8 @@
 
 A recording shows an effect that it excites: at the size put in, the effect changes what the best set of the untouched
 recording predicts by more than that set's parameters can follow. Half the square of the rest, in units of the noise, is
-what it can gain [nats] (Kay 1998, section 13.7); below `EFFECT_NATS` no diagnosis could name it.
+what it can gain [nats] (Kay 1998, section 13.7); below `EFFECT_NATS` no diagnosis could name it. Rows that a limit
+drops are counted, so a limit's figure is too large; and the rest is linear, so a long delay's is too.
 
 The untouched recording has a gap of its own, so a size is compared twice: on top of what the untouched recording's
 answer has of the effect; and "beside the same effects", on top of what the untouched recording has of it where the

@@ -50,7 +50,7 @@ from avtorch.gap.engine.priors import (
 from avtorch.gap.engine.roughness import SIGNS, roughness
 from avtorch.gap.engine.search import Search
 from avtorch.gap.engine.shape_error import relative_size, shape_likelihood, shape_log_odds, shape_log_prior
-from avtorch.gap.engine.slow_forces import SlowForces, SlowOnset, cycle_response, pulling_lags, slow_forces, slow_onset
+from avtorch.gap.engine.slow_forces import SlowForces, cycle_response, pulling_lags, slow_forces, slow_onset
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
 _EXAMINED = 8  # hypotheses that are examined in full
@@ -159,8 +159,7 @@ class ModelAverage:
 
 def examined_sets(search: Search) -> list[Examined]:
     """The best visited sets, the base, and the best single effects, examined."""
-    ranked = [h for h in search.visited.values() if _acts(h)]
-    ranked.sort(key=lambda h: -h.score)
+    ranked = sorted(search.visited.values(), key=lambda h: -h.score)
     chosen = [h for h in ranked if h.score > ranked[0].score - WITHIN_NATS][:_EXAMINED]
     single = [h for h in ranked if len(h.effects) == len(search.base.effects) + 1]
     chosen += [h for h in (search.visited[search.key(search.base)], *single[:2]) if h not in chosen]
@@ -175,16 +174,17 @@ def examine(h: Hypothesis, search: Search) -> Examined:
     compositions = [_composed(h, "", 0.0, h.residual, exact, lags)]
     mirror = 0.0
     if not h.alone:  # with one channel no free form can be told from the base's own dynamics and slow force
-        first = slow_forces(data, h.residual, _from_the_start(h), lags=lags)
         forms, mirror = _free_forms(h, search)
-        late = {kind: slow_onset(data, h.residual, first, kind) for kind in ("gust", "road")}
+        forms = forms if _acts(h) else {}
+        left = {"": h.residual} | {name: x.residual for name, x in forms.items() if x.residual is not None}
         compositions += [
-            _composed(h, name, found.nats, found.residual, exact, lags, least=_LEAST_FORM_NATS)
-            for name, found in forms.items()
-            if found.residual is not None
+            _composed(h, name, forms[name].nats, residual, exact, lags, least=_LEAST_FORM_NATS)
+            for name, residual in left.items()
+            if name
         ]
-        compositions = [_set_in(c, late) for c in compositions if c is not None]
-        compositions += [_cycle(h, compositions[0]), *(_rough(h, compositions[0], form) for form in SIGNS)]
+        compositions = [_set_in(c, h, left[c.form], lags) for c in compositions if c is not None]
+        if forms:
+            compositions += [_cycle(h, compositions[0]), *(_rough(h, compositions[0], form) for form in SIGNS)]
     beside = {}
     for e in h.effects if len(h.effects) > 1 else []:
         rest = search.without(h, e)
@@ -292,7 +292,7 @@ def _given(label: str, prior: Mapping[str, float]) -> float:
 
 
 def _acts(h: Hypothesis) -> bool:
-    """Whether no effect of the set is too faint for a name: beside nothing, a free form is none of its kind."""
+    """Whether no effect of the set is faint: beside next to nothing, a free form is none of its kind."""
     return all(e.startswith("~") or EFFECTS[e].size(h.values, h.neutral) > 1 for e in h.effects)
 
 
@@ -363,10 +363,12 @@ def _rough(h: Hypothesis, plain: Composition, form: str) -> Composition | None:
     return replace(plain, form=form, nats=nats, relative=relative, total=total)
 
 
-def _set_in(c: Composition, late: Mapping[str, SlowOnset]) -> Composition:
-    """The composition with a gust and a road that set in during the drive, where that gains more than a time is
-    worth."""
-    total, slow, gust, road = dict(c.total), c.slow, late["gust"], late["road"]
+def _set_in(c: Composition, h: Hypothesis, residual: FloatArray, lags: FloatArray) -> Composition:
+    """The composition, whose form has left `residual`, with a gust and a road that set in during the drive, where that
+    gains more than a time is worth."""
+    whole = slow_forces(h.data, residual, _from_the_start(h), lags=lags)
+    gust, road = slow_onset(h.data, residual, whole, "gust"), slow_onset(h.data, residual, whole, "road")
+    total, slow = dict(c.total), c.slow
     if gust.time is not None:
         total["gust"] += gust.nats
         slow = replace(slow, gust_sd=gust.sd, gust_time=gust.scale)

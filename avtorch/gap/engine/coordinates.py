@@ -118,8 +118,7 @@ class EngineEffect:
     kind: type[Effect] | None = None
 
     def size(self, values: FloatArray, neutral: FloatArray) -> float:
-        """How large it is at `values` (parameter,), in units of the faintest that has a name; infinite without
-        a size."""
+        """How large it is at `values` (parameter,), in units of `faint`; infinite without a size."""
         sized = [c for c in self.coordinates if c.faint]
         if not sized:
             return math.inf
@@ -217,8 +216,9 @@ _RING = (
     # a ring follows a step in its direction; the other sign would be one more lag
     Coordinate("ring_amplitude", "amplitude", "value", 0, 8, 0.3, FAINT_OF_RANGE * 0.5 / 3),
     _nuisance("ring_frequency", "frequency_hz", 2.5, 1.2, 0.8, 5.5),
+    _nuisance("ring_damping", "mode_damping", 0.08, 0.05, 0.01, 0.35),
 )
-_RING_STARTS = tuple((0.3, f) for f in (1.0, 1.25, 1.6, 2.0, 2.5, 3.0, 3.6, 4.4))
+_RING_STARTS = tuple((0.3, f, 0.08) for f in (1.0, 1.25, 1.6, 2.0, 2.5, 3.0, 3.6, 4.4))
 _LINEAR = (
     _nuisance("free_pole", "", 0.0, 0.3, -3.0, 0.0),
     _nuisance("free_frequency", "", 1.8, 0.8, 0.6, 3.5),

@@ -43,8 +43,9 @@ SHAPE_ERROR_FOUND = 0.2
 SCALE_OF_RANGE = 0.6
 """Scale of an effect's prior, Student t with three degrees of freedom, over the far end of its typical range [-]."""
 FAINT_OF_RANGE = 0.3
-"""Size below which an effect has no name, over the near end of its typical range [-] (a third of the far end where it
-has a sign): the prior vanishes there as exp(-(faint / size)²), a non-local prior (Johnson and Rossell 2010)."""
+"""Faint size of an effect, over the near end of its typical range [-] (a third of the far end where it has a sign): the
+prior vanishes there as exp(-(faint / size)²), a non-local prior (Johnson and Rossell 2010). A fainter one has a name
+only where a long drive pays for it."""
 
 MAP_SIZE = (0.2, 1.2)
 """Relative size of a car's force beyond K u over the demanded acceleration [-], log-normal by mean and standard

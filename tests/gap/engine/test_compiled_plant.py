@@ -30,7 +30,7 @@ VALUES = {
     "speed_dependent_gain": (-0.3,),
     "gain_change": (-0.25, math.log(4.3)),
     "gear_shift": (0.7, 0.31),
-    "driveline_oscillation": (0.2, 2.3),
+    "driveline_oscillation": (0.2, 2.3, 0.12),
     "aerodynamic_drag": (4e-4, 2.0),
     "viscous_drag": (0.013,),
     "constant_resistance": (0.12,),
