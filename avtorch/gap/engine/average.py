@@ -50,7 +50,14 @@ from avtorch.gap.engine.priors import (
 from avtorch.gap.engine.roughness import SIGNS, roughness
 from avtorch.gap.engine.search import Search
 from avtorch.gap.engine.shape_error import relative_size, shape_likelihood, shape_log_odds, shape_log_prior
-from avtorch.gap.engine.slow_forces import SlowForces, cycle_response, pulling_lags, slow_forces, slow_onset
+from avtorch.gap.engine.slow_forces import (
+    SlowForces,
+    cycle_response,
+    pulling_lags,
+    sensors_by_frame,
+    slow_forces,
+    slow_onset,
+)
 from avtorch.gap.simulator.effect import EFFECTS as TABLE
 
 _EXAMINED = 8  # hypotheses that are examined in full
@@ -311,6 +318,7 @@ def _composed(
     """Slow forces beside a free form that has left `residual`, at every error of the effects' shape."""
     data = h.data
     shape = h.shape if residual is h.residual else shape_likelihood(data, residual, h.effect_energy)
+    sensors = sensors_by_frame(h)
     logs = np.zeros(1) if shape is None else shape.nats + shape_log_prior(h.effects)
     over = nats + log_sum(logs) - log_sum(h.shape_log)
     if form and over < least:
@@ -323,7 +331,7 @@ def _composed(
         if value < logs.max() - 6:
             continue
         given = None if shape is None else (np.ascontiguousarray(shape.covariances[k]), shape.counts[k])
-        found = slow_forces(data, residual, _from_the_start(h), given=given, lags=lags, cycle=asked)
+        found = slow_forces(data, residual, _from_the_start(h), given, lags, sensors=sensors, cycle=asked)
         free = -0.5 * float((found.counts * (np.linalg.slogdet(found.covariance)[1] + data.channel_count)).sum())
         total = exact + nats + float(value) + found.log_likelihood - free
         for name, more in zip(kinds, (0.0, found.gust, found.road, found.cycle), strict=False):
@@ -366,7 +374,7 @@ def _rough(h: Hypothesis, plain: Composition, form: str) -> Composition | None:
 def _set_in(c: Composition, h: Hypothesis, residual: FloatArray, lags: FloatArray) -> Composition:
     """The composition, whose form has left `residual`, with a gust and a road that set in during the drive, where that
     gains more than a time is worth."""
-    whole = slow_forces(h.data, residual, _from_the_start(h), lags=lags)
+    whole = slow_forces(h.data, residual, _from_the_start(h), lags=lags, sensors=sensors_by_frame(h))
     gust, road = slow_onset(h.data, residual, whole, "gust"), slow_onset(h.data, residual, whole, "road")
     total, slow = dict(c.total), c.slow
     if gust.time is not None:

@@ -68,6 +68,8 @@ GUST_TIME_GRID_S = np.array([0.7, 1.0, 1.5, 2.2, 3.2, 4.7, 7.0])
 ROAD_LENGTH_GRID_M = np.array([180.0, 280.0, 420.0, 650.0, 1000.0])
 CYCLE_HZ = (0.2, 1.9)
 """Frequencies of cycles [Hz], in half bands: at 20 m/s a road has slower ones, of waves of 100 m and more."""
+SENSORS = [INDEX["sensor_lag"], INDEX["speed_lag"], INDEX["sensor_scale"]]
+"""Coordinates of readings that show late, or larger, what pushes the car."""
 PULLING_LAG_RATIOS = 2.0 ** np.arange(6)
 """Lags over the actuator's own, by which a saturated actuator pulls back what disturbs it [-]."""
 ONSET_SHARES = (0.12, 0.85)
@@ -95,8 +97,8 @@ class SlowForces:
     `cycle` [nats], its `cycle_sd` [m/s²] and `cycle_hz`: likewise; no nats where it was not asked for.
 
     `process_power` (band,) [(m/s²)²] at the best gust; `covariance` (band, channel, channel) and `counts`
-    (band,) are what was explained; `sensor` (band, channel, channel): factors by which a covariance becomes that before
-    a sensor that lags or has another scale.
+    (band,) are what was explained; `sensor` (channel, frame, band): factors by which a residual becomes that before a
+    sensor that lags or has another scale.
     """
 
     log_likelihood: float
@@ -247,6 +249,12 @@ def _cost(s00: float, s11: float, s01: float, P: float, a: float, c: float) -> f
 
 
 # the forces -----------------------------------------------------------------------------------------------------------
+def sensors_by_frame(h: Hypothesis) -> FloatArray:
+    """Lags of the accelerometer and of the speed [s], and what the former's scale is off, (3, frame)."""
+    acts = h.data.frame_time >= h.onset_vector()[SENSORS, None]
+    return np.where(acts, h.values[SENSORS, None], h.neutral[SENSORS, None])
+
+
 def pulling_lags(h: Hypothesis) -> FloatArray:
     """Lags (lag,) [s] by which the actuator of a hypothesis may pull back what disturbs the car.
 
@@ -270,20 +278,24 @@ def slow_forces(
     given: tuple[FloatArray, FloatArray] | None = None,
     lags: FloatArray | None = None,
     *,
+    sensors: FloatArray | None = None,
     cycle: bool = False,
 ) -> SlowForces:
     """Process noise, gust and road in `residual` (channel, frame, bin) of a hypothesis with `values` (parameter,).
 
-    With `cycle`, a cycle too.
+    With `cycle`, a cycle too. `sensors` (3, frame), see `sensors_by_frame`: those of `values` where not given.
 
     `given`: covariance (band, channel, channel) and counts (band,) in place of the residual's; bands beyond `SLOW_HZ`
     are ignored. `lags` (lag,) [s], see `pulling_lags`: the likeliest counts; T_L where not given.
     """
     frequency, energy = data.band_response
     bands = len(energy)
-    covariance, counts = (band_covariance(data, residual), data.band_size) if given is None else given
-    sensor = _before_the_sensor(data, values, bands)
-    covariance, counts = np.ascontiguousarray(covariance[:bands] * sensor), np.asarray(counts[:bands], float)
+    sensor = _before_the_sensor(data, values[SENSORS, None] if sensors is None else sensors, bands)
+    covariance, counts = band_covariance(data, _before(data, residual, sensor))[:bands], data.band_size
+    if given is not None:
+        less, counts = given[0][:bands] - band_covariance(data, residual)[:bands], given[1]
+        covariance = covariance + less * np.einsum("ifb,jfb->bij", sensor, sensor) / data.frame_count
+    covariance, counts = np.ascontiguousarray(covariance), np.asarray(counts[:bands], float)
 
     def nats(force: FloatArray, road: FloatArray | float = 0.0) -> FloatArray:
         """(...,) of powers (..., band) of a force and of a road."""
@@ -360,13 +372,9 @@ def cycle_response(data: DriveData, residual: FloatArray, found: SlowForces) -> 
     power = found.cycle_sd**2 * (cycle_spectrum(frequency, found.cycle_hz) @ energy.T)
     process = found.process_power * (found.process_noise_beside_cycle / found.process_noise_beside_gust) ** 2
     variances = wishart_profile(found.covariance, found.counts, power + process)[1]
-    scale = np.sqrt(np.diagonal(found.sensor, axis1=1, axis2=2))  # (band, channel)
-    scale = np.repeat(scale, np.diff(data.band_edges[: found.bands + 1]), axis=0).T[:, None]
-    before = residual[:, :, : scale.shape[-1]] * scale
     noise = process[:, None, None] + np.eye(2) * variances[:, None]
-    out = np.zeros_like(residual)
-    out[:, :, : scale.shape[-1]] = expected_force(data, before, power[None], noise) / scale
-    return out
+    before = _before(data, residual, found.sensor)
+    return _before(data, expected_force(data, before, power[None], noise), 1 / found.sensor)
 
 
 def expected_force(data: DriveData, residual: FloatArray, power: FloatArray, noise: FloatArray) -> FloatArray:
@@ -435,9 +443,9 @@ def slow_onset(
         return (-0.5 * counts * (np.log(total) + covariance[..., 0, 0] / total)).sum(-1)
 
     edges = data.band_edges[: found.bands + 1]
-    low = residual[:, :, : edges[-1]]
+    low = _before(data, residual, found.sensor)[:, :, : edges[-1]]
     products = np.moveaxis(np.add.reduceat(low[:, None] * low, edges[:-1], axis=-1), 2, 0)  # frame, C, C, band
-    before = np.moveaxis(np.cumsum(products, axis=0), -1, 1) / np.diff(edges)[:, None, None] * found.sensor
+    before = np.moveaxis(np.cumsum(products, axis=0), -1, 1) / np.diff(edges)[:, None, None]
     cuts = np.arange(max(int(ONSET_SHARES[0] * frames), 3), min(int(ONSET_SHARES[1] * frames), frames - 3) + 1)
     n = np.diff(edges) * cuts[:, None].astype(float)
     m = np.diff(edges) * (frames - cuts[:, None].astype(float))
@@ -467,24 +475,30 @@ def _mean_speed(data: DriveData) -> float:
     return max(float(data.smooth_speed.mean()), 2.0)
 
 
-def _before_the_sensor(data: DriveData, values: FloatArray, bands: int) -> FloatArray:
-    """Factors (band, channel, channel) of a covariance: what pushes the car passes the lags and the scale of readings.
+def _before_the_sensor(data: DriveData, sensors: FloatArray, bands: int) -> FloatArray:
+    """Factors (channel, frame, band) of a residual: what pushes the car passes the lags and the scale of readings.
 
     Of a common power P the accelerometer shows P |H|², and P Re H together with the speed; for one pole of scale k,
     P k² / L and P k / L with L = 1 + (w tau)². Scaled by L / k it shows P in common with the speed, and what is out of
     phase beside its own noise. So does a speed that lags; where both do, the slower one is scaled by what it lags
     more. A reading is scaled, so that a covariance stays one.
     """
-    out = np.ones((bands, data.channel_count, data.channel_count))
+    first, last = data.band_edges[:bands], data.band_edges[1 : bands + 1] - 1
+    out = np.ones((data.channel_count, data.frame_count, bands))
     if data.channel_count == 2:
-        first, last = data.band_edges[:bands], data.band_edges[1 : bands + 1] - 1
         w = np.pi * (data.frequency[first] + data.frequency[last])
-        lags = w * values[[INDEX["sensor_lag"], INDEX["speed_lag"]]][:, None]
+        lags = np.broadcast_to(sensors[:2, :, None] * w, out.shape)
         quick, slow = np.sort(1 + lags**2, axis=0)
         scales = np.array([np.sqrt(quick), slow * np.sqrt(quick) / (1 + lags.prod(0))])
-        scales = scales[np.argsort(lags[:, -1])]
-        scales[0] /= 1 + values[INDEX["sensor_scale"]]
-        out = scales.T[:, :, None] * scales.T[:, None, :]
+        out = np.take_along_axis(scales, np.argsort(lags[..., -1:], axis=0), 0)
+        out[0] /= 1 + sensors[2, :, None]
+    return out
+
+
+def _before(data: DriveData, residual: FloatArray, sensor: FloatArray) -> FloatArray:
+    """A `residual` (channel, frame, bin) by factors (channel, frame, band) of the lowest bands; 0 above."""
+    edges, out = data.band_edges[: sensor.shape[-1] + 1], np.zeros_like(residual)
+    out[:, :, : edges[-1]] = residual[:, :, : edges[-1]] * np.repeat(sensor, np.diff(edges), axis=-1)
     return out
 
 

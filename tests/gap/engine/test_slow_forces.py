@@ -24,6 +24,7 @@ from avtorch.gap.engine.slow_forces import (
     process_spectrum,
     pulling_lags,
     road_spectrum,
+    sensors_by_frame,
     slow_forces,
     slow_onset,
     wishart_log_likelihood,
@@ -335,6 +336,22 @@ def test_process_noise_behind_a_sensor_that_lags_is_no_gust(rotating_seed: int) 
     # a likelihood ratio against what is true exceeds x nats in exp(-x) of all drives; the grids leave some more
     assert slow_forces(data, residual, values).gust < 8
     assert slow_forces(data, residual, NEUTRAL).gust > 20  # a sensor that is taken for a good one
+
+
+@pytest.mark.statistical
+def test_also_of_a_sensor_that_lags_from_a_time_on(rotating_seed: int) -> None:
+    rng, data = np.random.default_rng(rotating_seed), _data(900)
+    force, lag_s = _process_noise(rng, len(data.time), 0.15), 0.8
+    keep = np.exp(-1 / (RATE_HZ * lag_s))
+    h = Hypothesis(data).with_effect("sensor_lag", (lag_s,), 300.0)
+    late = data.time >= 300.0
+    felt = np.where(late, lfilter([1 - keep], [1, -keep], force * late), force)
+    residual = _residual(data, rng, force)
+    residual[0] += data.transform([felt - force, force])[0]
+    sensors = sensors_by_frame(h)
+    assert (sensors == lag_s * np.array([[1], [0], [0]]) * (data.frame_time >= 300.0)).all()
+    assert slow_forces(data, residual, NEUTRAL, sensors=sensors).gust < 8
+    assert slow_forces(data, residual, NEUTRAL).gust > 20
 
 
 @pytest.mark.parametrize(("lag_s", "scale"), [(0.0, 0.0), (0.6, 0.0), (2.5, 0.3)])
