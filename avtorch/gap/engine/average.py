@@ -52,6 +52,7 @@ from avtorch.gap.engine.search import Search
 from avtorch.gap.engine.shape_error import relative_size, shape_likelihood, shape_log_odds, shape_log_prior
 from avtorch.gap.engine.slow_forces import (
     SlowForces,
+    SlowOnset,
     cycle_response,
     pulling_lags,
     sensors_by_frame,
@@ -189,9 +190,12 @@ def examine(h: Hypothesis, search: Search) -> Examined:
             for name, residual in left.items()
             if name
         ]
-        compositions = [_set_in(c, h, left[c.form], lags) for c in compositions if c is not None]
-        if forms:
-            compositions += [_cycle(h, compositions[0]), *(_rough(h, compositions[0], form) for form in SIGNS)]
+        plain = compositions[0]
+        late = _late_forces(h, h.residual, lags)
+        compositions = [_set_in(c, late, _late_forces(h, left[c.form], lags)) for c in compositions if c is not None]
+        if forms and plain is not None:
+            # beside slow forces that act throughout: what is louder from a time on is louder in some frames, too
+            compositions += [_cycle(h, plain), *(_rough(h, plain, form) for form in SIGNS)]
     beside = {}
     for e in h.effects if len(h.effects) > 1 else []:
         rest = search.without(h, e)
@@ -210,15 +214,16 @@ def _free_forms(h: Hypothesis, search: Search) -> tuple[dict[str, FreeFormFit], 
     """Each free form beside a hypothesis, and the nats of the mirrored linear bank."""
     # where bases have a map, it is there that a map stands beside these effects
     others = {name: form for name, form in linear_forms(h).items() if name != "map" or not search.map_bases}
-    forms = {name: explained(h, form) for name, form in others.items()}
-    mirror = 0.0
-    if forms["linear"].nats > 0 or _LINEAR & set(h.names):
-        mirror = max(explained(h, mirror_columns(h)).nats, 0.0)
-        forms["linear"] = forms["linear"]._replace(nats=forms["linear"].nats - mirror)
-    if forms["sided"].nats > 0:
-        echo = max(explained(h, mirror_columns(h, "sided")).nats, 0.0)
-        forms["sided"] = forms["sided"]._replace(nats=forms["sided"].nats - echo)
-    return forms | wandering(h) | {"sensor": explained_or_late(h, sensor_form(h))}, mirror
+    forms = {name: explained(h, form) for name, form in others.items()} | wandering(h)
+    forms["sensor"] = explained_or_late(h, sensor_form(h))
+    mirrors = {
+        name: max(explained(h, mirror_columns(h, name)).nats, 0.0)
+        for name in ("linear", "sided", "sensor")
+        if forms[name].nats > 0 or (name == "linear" and _LINEAR & set(h.names))
+    }
+    for name, echo in mirrors.items():
+        forms[name] = forms[name]._replace(nats=forms[name].nats - echo)
+    return forms, mirrors.get("linear", 0.0)
 
 
 def free_form_response(x: Examined, search: Search, form: str) -> FloatArray | None:
@@ -371,11 +376,16 @@ def _rough(h: Hypothesis, plain: Composition, form: str) -> Composition | None:
     return replace(plain, form=form, nats=nats, relative=relative, total=total)
 
 
-def _set_in(c: Composition, h: Hypothesis, residual: FloatArray, lags: FloatArray) -> Composition:
-    """The composition, whose form has left `residual`, with a gust and a road that set in during the drive, where that
-    gains more than a time is worth."""
+def _late_forces(h: Hypothesis, residual: FloatArray, lags: FloatArray) -> tuple[SlowOnset, SlowOnset]:
+    """A gust and a road that set in during the drive."""
     whole = slow_forces(h.data, residual, _from_the_start(h), lags=lags, sensors=sensors_by_frame(h))
-    gust, road = slow_onset(h.data, residual, whole, "gust"), slow_onset(h.data, residual, whole, "road")
+    return slow_onset(h.data, residual, whole, "gust"), slow_onset(h.data, residual, whole, "road")
+
+
+def _set_in(c: Composition, late: tuple[SlowOnset, SlowOnset], beside: tuple[SlowOnset, SlowOnset]) -> Composition:
+    """The composition with a gust and a road that set in during the drive, where that gains more than a time is worth:
+    as much as `beside` its form, and no more than `late` ones gain without it, which a form may only have bent."""
+    gust, road = (own._replace(nats=min(own.nats, alone.nats)) for own, alone in zip(beside, late, strict=True))
     total, slow = dict(c.total), c.slow
     if gust.time is not None:
         total["gust"] += gust.nats

@@ -313,10 +313,11 @@ def simulate(
                 f00, f01, f10, f11 = modes(1.0 / (omega * omega), 2.0 * _FREE_DAMPING / omega, h)
                 f01, f10 = f01 / omega, omega * f10
             j = (a - before) / h
-            omega = 2.0 * math.pi * p[_RING_F]
-            y = r00 * ring_y + r01 * ring_r + (1.0 - r00) / omega * j
-            ring_r = r10 * ring_y + r11 * ring_r - r10 / omega * j
-            ring_y = y
+            if q[_RING_A] != 0.0 or q[_RING_Q] != 0.0:  # at its onset a mode is at rest
+                omega = 2.0 * math.pi * p[_RING_F]
+                y = r00 * ring_y + r01 * ring_r + (1.0 - r00) / omega * j
+                ring_r = r10 * ring_y + r11 * ring_r - r10 / omega * j
+                ring_y = y
             omega = 2.0 * math.pi * p[_FREE_F]
             y = f00 * free_y + f01 * free_r + (1.0 - f00) / omega * j
             free_r = f10 * free_y + f11 * free_r - f10 / omega * j

@@ -102,11 +102,7 @@ def linear_forms(h: Hypothesis) -> dict[str, FreeForm]:
 def sensor_form(h: Hypothesis) -> FreeForm:
     """Linear dynamics of each reading alone: a sensor that lags, leads, or rings."""
     short, _, long, longest = _bank(h)
-    of_car = demand_response(h, np.tile(h["K_L"] * h.command(), (3, 1)), np.array([short, long, longest]))
-    each = np.zeros((h.data.channel_count, *of_car.shape))
-    for channel in range(h.data.channel_count):
-        each[channel, :, channel] = of_car[:, channel]
-    return FreeForm("sensor", each.reshape(-1, *of_car.shape[1:]))
+    return FreeForm("sensor", _each_reading(_command_bank(h, [short, long, longest])))
 
 
 def map_free_form(h: Hypothesis, form: MapForm) -> FreeForm:
@@ -117,10 +113,27 @@ def map_free_form(h: Hypothesis, form: MapForm) -> FreeForm:
 
 
 def mirror_columns(h: Hypothesis, form: str = "linear") -> FreeForm:
-    """The bank of a `form` ("linear", "sided") run backwards in time: the answer to a command before it was given."""
-    lags, u = np.array(_bank(h)), h["K_L"] * h.command()
-    demands = np.tile(np.maximum(u, 0.0) if form == "sided" else u, (len(lags), 1))
-    return FreeForm("mirror", demand_response(h, demands, lags, backwards=True))
+    """The bank of a `form` ("linear", "sided", "sensor") run backwards in time: the answer to a command before it was
+    given."""
+    short, middle, long, longest = _bank(h)
+    if form == "sensor":
+        return FreeForm("mirror", _each_reading(_command_bank(h, [short, long, longest], backwards=True)))
+    return FreeForm("mirror", _command_bank(h, [short, middle, long, longest], form == "sided", backwards=True))
+
+
+def _command_bank(h: Hypothesis, lags: Sequence[float], driving: bool = False, backwards: bool = False) -> FloatArray:
+    """Responses (column, channel, frame, bin) of first-order lags [s] to the command, or to its positive part."""
+    u = h["K_L"] * h.command()
+    demands = np.tile(np.maximum(u, 0.0) if driving else u, (len(lags), 1))
+    return demand_response(h, demands, np.array(lags), backwards=backwards)
+
+
+def _each_reading(columns: FloatArray) -> FloatArray:
+    """The same columns (column, channel, frame, bin) in one channel alone, each in turn."""
+    each = np.zeros((columns.shape[1], *columns.shape))
+    for channel in range(columns.shape[1]):
+        each[channel, :, channel] = columns[:, channel]
+    return each.reshape(-1, *columns.shape[1:])
 
 
 def explained(h: Hypothesis, form: FreeForm) -> FreeFormFit:

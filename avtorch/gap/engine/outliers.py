@@ -10,7 +10,8 @@ is the log likelihood of the first kind over the second. A filter of the recorde
 convolved with it, c on a grid.
 
 Where errors are nearly white both kinds are alike, and the law of the innovations decides: a normal contaminated by a
-wider one (Tukey 1960; Box and Tiao 1968) is what outliers make, Student's is what vibration makes.
+wider one (Tukey 1960; Box and Tiao 1968) is what outliers make, Student's is what vibration makes. So do the sizes of
+what is additive.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from scipy.ndimage import maximum_filter1d
-from scipy.special import gammaln
+from scipy.special import gammaln, log_ndtr
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.gap.engine.coordinates import INDEX
@@ -115,9 +116,10 @@ def sensor_outliers(h: Hypothesis) -> Outliers:
     suspect = ~(_after_steps(data)[found.rows] | _lasting(single, places, max(3, LONGEST_S / data.dt)))
     mixture, student, normal = tail_log_likelihoods(single[suspect])
     tails = max(mixture - max(student, normal) - MIXTURE_NATS, mixture - normal - HEAVY_NATS_PER_ROW * suspect.sum())
-    additive, smear, at = additive_over_innovational(np.where(suspect, found.z, 0.0), found.pi, data.dt)
+    additive, smear, at, sizes = additive_over_innovational(np.where(suspect, found.z, 0.0), found.pi, data.dt)
     if (found.pi**2).sum() <= COLOUR:
         additive = -math.inf
+    additive = min(additive, contaminated_over_student(sizes))
     if tails > additive:
         smear, at = 0.0, np.flatnonzero(suspect & (np.abs(single) > SUSPECT))
     starts, flags = found.rows[at], nothing
@@ -215,13 +217,13 @@ def outliers_alone(z: FloatArray, pi: FloatArray) -> tuple[FloatArray, BoolArray
     return np.clip(left + found, -CLIP, CLIP), found != 0
 
 
-def additive_over_innovational(z: FloatArray, pi: FloatArray, dt: float) -> tuple[float, float, IntArray]:
-    """Nats of additive over innovational outliers in innovations `z` (innovation,), the smear, and their places.
+def additive_over_innovational(z: FloatArray, pi: FloatArray, dt: float) -> tuple[float, float, IntArray, FloatArray]:
+    """Nats of additive over innovational outliers in innovations `z` (innovation,), the smear, their places and sizes.
 
     `pi` (order + 1,): the filter from errors to innovations. Suspects that are rather shocks count against it.
     """
     z = np.clip(z, -CLIP, CLIP)
-    best = (-math.inf, 0.0, np.zeros(0, np.int64))
+    best = (-math.inf, 0.0, np.zeros(0, np.int64), np.zeros(0))
     # the largest innovation from two rows before to the end of the pattern
     largest = np.concatenate([np.zeros(2), np.abs(z)])
     largest = np.lib.stride_tricks.sliding_window_view(largest, _TAPS + 2).max(1) if len(z) > _TAPS else largest[:0]
@@ -234,8 +236,17 @@ def additive_over_innovational(z: FloatArray, pi: FloatArray, dt: float) -> tupl
         gains = 0.5 * (matched[at] ** 2 - largest[at] ** 2)
         total = float(gains.sum()) - SUSPECT_NATS * int((gains > 0).sum())
         if total > best[0]:
-            best = (total, smear, at[gains > 0])
+            best = (total, smear, at[gains > 0], matched[at[gains > 0]])
     return best
+
+
+def contaminated_over_student(sizes: FloatArray) -> float:
+    """Nats of a normal over Student's tail in what additive outliers add, `sizes` (outlier,) beyond `SUSPECT`: white
+    noise with tails on a coloured error is additive, too."""
+    n, wide = len(sizes), np.hypot(1.0, _WIDTHS)
+    normal = -0.5 * float(sizes @ sizes) / wide**2 - n * (np.log(wide) + HALF_LOG_2PI + log_ndtr(-SUSPECT / wide))
+    tail = n * np.log(_STUDENT_DOF / SUSPECT) - (_STUDENT_DOF + 1) * float(np.log(sizes / SUSPECT).sum())
+    return float(normal.max() - tail.max())
 
 
 def tail_log_likelihoods(z: FloatArray) -> tuple[float, float, float]:

@@ -2,8 +2,8 @@
 
 It runs the simulator's own effects and actuator on the grid of a drive, stretch by stretch; a test holds it to the
 compiled plant. An effect that sets in later is neutral until then. One whose memory would have filled by then (a play,
-a sensor's filter) begins there at rest; an actuator that changes is cut in two there, and its second part begins at the
-acceleration which the first has reached.
+a ring, a sensor's filter) begins there at rest; an actuator that changes is cut in two there, and its second part
+begins at the acceleration which the first has reached.
 
 Where a user's own effect or baseline takes part, the simulator responds as a whole.
 
@@ -39,7 +39,7 @@ from avtorch.gap.simulator.simulator_input import SimulatorInput
 Values = Mapping[str, Tensor]
 """Coordinates by name, (column,) each, or () where all columns share the value."""
 
-_FILLING = frozenset({"backlash", "sensor_lag", "speed_lag"})
+_FILLING = frozenset({"backlash", "driveline_oscillation", "sensor_lag", "speed_lag"})
 _UNNAMED = "~linear"
 _NO_LIMIT = 1e9  # [m/s², m/s³] replaces infinity, whose gradients are undefined
 
@@ -139,12 +139,14 @@ class TorchPlant:
         chain = in_order(effects)
 
         def hook(e: Effect, x: Tensor) -> Any:
-            before = late[e.name] - 1
+            force = e.place == "body"
+            before = late[e.name] - (not force)
             if before < 1 or e.name not in _FILLING:
                 return e.over(x, row)
             rest = replace(row, time=row.time[before:], dt=row.dt[before:] if row.dt.dim() else row.dt)
             after = e.over(x[..., before:], rest)
-            return torch.cat([x[..., :before].expand(*after.shape[:-1], -1), after], -1)
+            without = torch.zeros_like(x) if force else x
+            return torch.cat([without[..., :before].expand(*after.shape[:-1], -1), after], -1)
 
         parts = substeps(chain, drive.command, row, hook)
         accel0, at = torch.as_tensor(drive.accel0).expand(columns), context_at(row, 0)
@@ -155,7 +157,7 @@ class TorchPlant:
         a, gained = _actuated(actuator0, parts, chain, late, steps)
         accel = a
         for e in at_place(chain, "body"):
-            force = e.over(a, row)
+            force = hook(e, a)
             accel = accel + force
             gained = gained + 0.5 * (row.dt[:-1] if row.dt.dim() else row.dt) * (force[..., 1:] + force[..., :-1])
         for e in at_place(chain, "sensor"):

@@ -12,7 +12,9 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.outliers import (
+    SUSPECT,
     additive_over_innovational,
+    contaminated_over_student,
     rate_onset,
     robust_innovations,
     sensor_outliers,
@@ -97,7 +99,7 @@ def test_an_additive_outlier_passes_the_filter_as_it_is(smear: float, rotating_s
     jumps = np.zeros(rows)
     jumps[places] = size * rng.choice([-1, 1], 20)
     z = lfilter(DYNAMICS, [1.0, -smear], jumps) + rng.normal(size=rows)
-    nats, found, at = additive_over_innovational(z, DYNAMICS, 1 / RATE_HZ)
+    nats, found, at, _ = additive_over_innovational(z, DYNAMICS, 1 / RATE_HZ)
     response = np.abs(lfilter(DYNAMICS, [1.0, -smear], np.eye(1, 12)[0]))
     gain = 0.5 * size**2 * ((response**2).sum() - (response**2).max())  # nats of each, without noise
     # the matched filter has unit variance around size |pi|, the largest of a pattern at most that of three rows
@@ -252,3 +254,14 @@ def test_a_steady_rate_has_no_onset(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     assert rate_onset(np.sort(rng.uniform(0, 100, 50)), 0.0, 100.0)[0] < log_odds(50)
     assert rate_onset(np.sort(rng.uniform(0, 100, 7)), 0.0, 100.0) == (0.0, None)
+
+
+@pytest.mark.statistical
+def test_tails_of_white_noise_on_a_coloured_error_are_no_outliers(rotating_seed: int) -> None:
+    """They are additive, too: four of sixty logs of recorders with such noise were said to have outliers."""
+    rng = np.random.default_rng(rotating_seed)
+    tails, wide = np.abs(rng.standard_t(4, 60_000)), np.abs(8 * rng.normal(size=500))
+    # a likelihood ratio against what is true exceeds x nats in exp(-x) of all draws; seven widths are tried
+    assert contaminated_over_student(tails[tails > SUSPECT]) < 14 + np.log(7)
+    # a third of a nat each, of three hundred; the sum's standard deviation is ten
+    assert contaminated_over_student(wide[wide > SUSPECT]) > 18
