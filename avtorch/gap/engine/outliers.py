@@ -113,7 +113,8 @@ def sensor_outliers(h: Hypothesis) -> Outliers:
     if found is None:
         return Outliers(-math.inf, nothing, np.zeros(0, np.int64), errors)
     single, places = outliers_alone(found.z, found.pi)
-    suspect = ~(_after_steps(data)[found.rows] | _lasting(single, places, max(3, LONGEST_S / data.dt)))
+    ends = np.diff(found.rows, append=-1) != 1
+    suspect = ~(_after_steps(data)[found.rows] | _lasting(single, places, ends, max(3, LONGEST_S / data.dt)))
     mixture, student, normal = tail_log_likelihoods(single[suspect])
     tails = max(mixture - max(student, normal) - MIXTURE_NATS, mixture - normal - HEAVY_NATS_PER_ROW * suspect.sum())
     additive, smear, at, sizes = additive_over_innovational(np.where(suspect, found.z, 0.0), found.pi, data.dt)
@@ -278,13 +279,15 @@ def _after_steps(data: DriveData) -> BoolArray:
     return near if near.mean() <= 0.3 else np.zeros(len(step), bool)
 
 
-def _lasting(z: FloatArray, places: BoolArray, longest: float) -> BoolArray:
-    """Innovations (innovation,) in runs of large ones, at most one small one between, of more than `longest`; additive
-    outliers at `places` (innovation,) are large."""
+def _lasting(z: FloatArray, places: BoolArray, ends: BoolArray, longest: float) -> BoolArray:
+    """Innovations (innovation,) in runs of large ones, at most one small one between, of more than `longest`, or of
+    more than one to the end of a stretch, as at `ends`, where they might have lasted; additive outliers at `places`
+    (innovation,) are large."""
     large = np.flatnonzero((np.abs(z) > 3.5) | places)
     run = np.cumsum(np.diff(large, prepend=large[:1]) > 2)
+    count, cut = np.bincount(run), np.bincount(run, ends[large]) > 0
     out = np.zeros(len(z), bool)
-    out[large] = np.bincount(run)[run] > longest
+    out[large] = ((count > longest) | (cut & (count > 1)))[run]
     return out
 
 

@@ -13,6 +13,7 @@ from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.outliers import (
     SUSPECT,
+    _lasting,
     additive_over_innovational,
     contaminated_over_student,
     rate_onset,
@@ -265,3 +266,12 @@ def test_tails_of_white_noise_on_a_coloured_error_are_no_outliers(rotating_seed:
     assert contaminated_over_student(tails[tails > SUSPECT]) < 14 + np.log(7)
     # a third of a nat each, of three hundred; the sum's standard deviation is ten
     assert contaminated_over_student(wide[wide > SUSPECT]) > 18
+
+
+def test_what_deviates_to_the_end_of_a_stretch_may_last() -> None:
+    """Three rows at the end of a stretch, where a driver had taken over, were outliers at 75 nats."""
+    z = np.zeros(40)
+    z[[5, 18, 19, 37, 38, 39]] = 9.0
+    ends = np.isin(np.arange(40), (19, 39))
+    assert np.flatnonzero(_lasting(z, z > 0, ends, 3)).tolist() == [18, 19, 37, 38, 39]
+    assert not _lasting(z, z > 0, np.zeros(40, bool), 3).any()
