@@ -6,7 +6,8 @@ The options are those of `engine_trial`, whose stored answers are read. Of each 
 noise. Half the squared distance between it and what the answer's best set predicts, in units of that set's noise
 [nats], is what any method could gain over the answer (Kay 1998, section 13.7). The errors of the set's own parameters
 leave half a nat each. Prints a row a miss, and how many logs tell less than a name costs. Of what chance decides
-(gusts, roads, outliers, lost messages) a drive without noise knows nothing: such causes are left out.
+(gusts, roads, outliers, lost messages) a drive without noise knows nothing, and where a car has stopped, noise has
+moved it on or not: such causes and drives are left out.
 """
 
 from __future__ import annotations
@@ -51,7 +52,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     beyond = []
     for one in missed:
         drawn = {"tiers": (one.place.tier,), "outside": cell.outside, "signals": cell.signals}
-        nats, parameters = told(draw_case(one.place.index, cell.seed(one.place.tier), **drawn))
+        case = draw_case(one.place.index, cell.seed(one.place.tier), **drawn)
+        if (case.run.true_speed <= 0).any():
+            continue
+        nats, parameters = told(case)
         beyond.append(nats - 0.5 * parameters)
         cells = (one.place.label, one.cause, one.row.verdict, f"{nats:.0f}", f"{0.5 * parameters:.1f}")
         print(f"| {' | '.join(cells)} |", flush=True)
