@@ -216,7 +216,7 @@ _RING = (
     # a ring follows a step in its direction; the other sign would be one more lag
     Coordinate("ring_amplitude", "amplitude", "value", 0, 8, 0.3, FAINT_OF_RANGE * 0.5 / 3),
     _nuisance("ring_frequency", "frequency_hz", 2.5, 1.2, 0.8, 5.5),
-    _nuisance("ring_damping", "mode_damping", 0.08, 0.05, 0.01, 0.35),
+    _nuisance("ring_damping", "mode_damping", 0.08, 0.05, 0.01, 0.2),  # more is no ring
 )
 _RING_STARTS = tuple((0.3, f, 0.08) for f in (1.0, 1.25, 1.6, 2.0, 2.5, 3.0, 3.6, 4.4))
 _LINEAR = (
