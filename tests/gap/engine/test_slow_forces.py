@@ -340,7 +340,7 @@ def test_process_noise_behind_a_sensor_that_lags_is_no_gust(rotating_seed: int) 
 
 @pytest.mark.statistical
 def test_also_of_a_sensor_that_lags_from_a_time_on(rotating_seed: int) -> None:
-    rng, data = np.random.default_rng(rotating_seed), _data(900)
+    rng, data = np.random.default_rng(rotating_seed), _data(1800)
     force, lag_s = _process_noise(rng, len(data.time), 0.15), 0.8
     keep = np.exp(-1 / (RATE_HZ * lag_s))
     h = Hypothesis(data).with_effect("sensor_lag", (lag_s,), 300.0)
@@ -351,7 +351,7 @@ def test_also_of_a_sensor_that_lags_from_a_time_on(rotating_seed: int) -> None:
     sensors = sensors_by_frame(h)
     assert (sensors == lag_s * np.array([[1], [0], [0]]) * (data.frame_time >= 300.0)).all()
     assert slow_forces(data, residual, NEUTRAL, sensors=sensors).gust < 8
-    assert slow_forces(data, residual, NEUTRAL).gust > 20
+    assert slow_forces(data, residual, NEUTRAL).gust > 60  # 163 in the mean of forty draws, and 16 about it
 
 
 @pytest.mark.parametrize(("lag_s", "scale"), [(0.0, 0.0), (0.6, 0.0), (2.5, 0.3)])
