@@ -182,8 +182,7 @@ def examine(h: Hypothesis, search: Search) -> Examined:
     compositions = [_composed(h, "", 0.0, h.residual, exact, lags)]
     mirror = 0.0
     if not h.alone:  # with one channel no free form can be told from the base's own dynamics and slow force
-        forms, mirror = _free_forms(h, search)
-        forms = forms if _acts(h) else {}
+        forms, mirror = _free_forms(h, search) if _acts(h) else ({}, _echo(h, "linear"))
         left = {"": h.residual} | {name: x.residual for name, x in forms.items() if x.residual is not None}
         compositions += [
             _composed(h, name, forms[name].nats, residual, exact, lags, least=_LEAST_FORM_NATS)
@@ -217,13 +216,18 @@ def _free_forms(h: Hypothesis, search: Search) -> tuple[dict[str, FreeFormFit], 
     forms = {name: explained(h, form) for name, form in others.items()} | wandering(h)
     forms["sensor"] = explained_or_late(h, sensor_form(h))
     mirrors = {
-        name: max(explained(h, mirror_columns(h, name)).nats, 0.0)
+        name: _echo(h, name)
         for name in ("linear", "sided", "sensor")
         if forms[name].nats > 0 or (name == "linear" and _LINEAR & set(h.names))
     }
     for name, echo in mirrors.items():
         forms[name] = forms[name]._replace(nats=forms[name].nats - echo)
     return forms, mirrors.get("linear", 0.0)
+
+
+def _echo(h: Hypothesis, form: str) -> float:
+    """Nats of the mirrored bank of a form."""
+    return max(explained(h, mirror_columns(h, form)).nats, 0.0)
 
 
 def free_form_response(x: Examined, search: Search, form: str) -> FloatArray | None:

@@ -124,3 +124,14 @@ def test_a_users_baseline_has_all_its_settings(effect: Effect):
         float(grid.accel0[0]),
     )
     np.testing.assert_allclose(h.on_grid()[0], simulator.response(drive).accel_measured.numpy(), atol=1e-9)
+
+
+def test_a_ring_begins_at_rest() -> None:
+    """The car does not jump where a ring sets in."""
+    h = Hypothesis(_data(1))
+    onset = float(h.data.time[700])
+    grid = h.data.grid.time
+    change = h.with_effect("driveline_oscillation", (2.0, 2.3, 0.05), onset).on_grid()[0] - h.on_grid()[0]
+    first = int(np.searchsorted(grid, onset))
+    assert (change[: first + 1] == 0).all()
+    assert np.abs(change[first + 1 :]).max() > 0.1
