@@ -73,21 +73,26 @@ def evaluate_evidence(h: Hypothesis) -> Hypothesis:
     slopes, (precision, _) = slopes_of(h), linear_priors(h, names)
     W = whitened_under_noise(h, slopes, precision, _ROUNDS)
     h.information = W @ W.T + np.diag(precision)
-    first = base.plain or base
-    first_claimed = claimed(first.data, first.covariance)
     h.effect_energy, h.shape, h.shape_log = None, None, np.zeros(1)
     if h.effects and h.predicted.shape == base.predicted.shape:
         h.effect_energy = effect_energy(h.data, h.predicted - base.predicted)
         h.shape = shape_likelihood(h.data, h.residual, h.effect_energy)
     if h.shape is not None:
         h.shape_log = h.shape.nats + shape_log_prior(h.effects)
-    gain = min(claimed(h.data, h.covariance) - first_claimed, h.log_likelihood - first.log_likelihood)
     volume = len(names) * HALF_LOG_2PI - 0.5 * float(np.linalg.slogdet(h.information)[1])
     prior = float(log_prior(h, names, torch.as_tensor(h.values[[INDEX[n] for n in names]])))
-    h.evidence = gain + log_sum(h.shape_log) + prior + volume + _onset_odds(h) + _force_density(h)
+    h.evidence = min(gains(h)) + log_sum(h.shape_log) + prior + volume + _onset_odds(h) + _force_density(h)
     h.evidence -= lost_nats(h) * len(h.lost) + SHIFT_NATS * len(h.shift_speeds) * ("gear_shift" in h.effects)
     h.score = h.evidence - TRIED_NATS * (len(h.effects) + (h.force is not None))
     return h
+
+
+def gains(h: Hypothesis) -> tuple[float, float]:
+    """What `h` gains over its base [nats]: in the bands below `claim_hz`, and in all."""
+    base = h.base or h
+    first = base.plain or base
+    claim = claimed(h.data, h.covariance) - claimed(first.data, first.covariance)
+    return claim, h.log_likelihood - first.log_likelihood
 
 
 def lost_nats(h: Hypothesis) -> float:

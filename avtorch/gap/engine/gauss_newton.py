@@ -13,7 +13,7 @@ import numpy as np
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.gap.engine.coordinates import COORDINATES, INDEX
 from avtorch.gap.engine.hypothesis import Hypothesis
-from avtorch.gap.engine.likelihood import band_covariance, log_likelihood, whiten
+from avtorch.gap.engine.likelihood import band_covariance, claim_bands, claimed, log_likelihood, whiten
 from avtorch.gap.engine.priors import RECORDER_DELAY_S, RECORDER_FILTER_S
 
 _RECORDER = {
@@ -170,8 +170,9 @@ def whitened_jacobian(h: Hypothesis, derivatives: FloatArray) -> FloatArray:
     return np.array([whiten(h.data, h.covariance, j) for j in derivatives])
 
 
-def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05) -> Hypothesis:
-    """The hypothesis at the maximum of `objective`, changed in place and returned.
+def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05, upper: float = 1.0) -> Hypothesis:
+    """The hypothesis at the maximum of `objective`, changed in place and returned; bands above `claim_hz` count with
+    the weight `upper`.
 
     Steps are shortened by damping until they gain; a coordinate that would leave its limits stays there and the others
     are solved again. A likelihood in a delay has creases, where commands arrive with a row: on one, no step gains, and
@@ -183,16 +184,16 @@ def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05) -> Hypothes
     boundless = np.full(len(h.force_coefficients), np.inf)
     low, high = np.concatenate([low, -boundless]), np.concatenate([high, boundless])
     h.evaluate()
-    current, damping = h.log_likelihood + penalty(h, names), 1e-3
+    damping, scale = 1e-3, _band_scale(h, upper)
     creased = np.array([n.endswith("_delay") or n == "dead_time" for n in names])
     creased = np.concatenate([creased, boundless < 0])
     held = np.zeros(len(creased), bool)
     for _ in range(iterations):
         slopes, precision, pull = linearised(h, names)
-        W = whitened_under_noise(h, slopes, precision, 1)
+        W = whitened_under_noise(h, slopes, precision, 1) * scale
         H = W @ W.T
-        current = h.log_likelihood + penalty(h, names)
-        g = W @ whiten(h.data, h.covariance, h.residual) + pull
+        current = _height(h, names, upper)
+        g = W @ (whiten(h.data, h.covariance, h.residual) * scale) + pull
         better = None
         for _ in range(10):
             A = H + np.diag(precision + damping * np.diag(H) + 1e-12)
@@ -201,7 +202,7 @@ def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05) -> Hypothes
             new.values[at], new.force_coefficients = x[: len(at)], x[len(at) :]
             new["T_L"] = min(max(new["T_L"], 0.4 * h["T_L"]), 2.5 * h["T_L"])
             new.evaluate()
-            value = new.log_likelihood + penalty(new, names)
+            value = _height(new, names, upper)
             if value > current - 1e-9:
                 better = new
                 break
@@ -213,7 +214,7 @@ def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05) -> Hypothes
                 damping = max(damping * 8, 1e-2)
         if better is None:
             break
-        gain, current = value - current, value
+        gain = value - current
         h.values, h.predicted, h.residual = better.values, better.predicted, better.residual
         h.force_coefficients = better.force_coefficients
         h.covariance, h.log_likelihood = better.covariance, better.log_likelihood
@@ -221,6 +222,20 @@ def fit(h: Hypothesis, iterations: int = 8, tolerance: float = 0.05) -> Hypothes
         if gain < tolerance:
             break
     return h
+
+
+def _height(h: Hypothesis, names: Sequence[str], upper: float) -> float:
+    """What a fit maximises [nats]."""
+    claim = 0.0 if upper == 1 else claimed(h.data, h.covariance)
+    return claim + upper * (h.log_likelihood - claim) + penalty(h, names)
+
+
+def _band_scale(h: Hypothesis, upper: float) -> FloatArray | float:
+    """Square root of the weight of each flat coefficient."""
+    if upper == 1:
+        return 1.0
+    bins = np.where(h.data.band_of_bin < claim_bands(h.data), 1.0, math.sqrt(upper))
+    return np.broadcast_to(bins, h.predicted.shape).ravel()
 
 
 def _within(

@@ -19,13 +19,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from avtorch.gap.engine.coordinates import EFFECTS, EngineEffect, base_name
-from avtorch.gap.engine.evidence import evaluate_evidence
+from avtorch.gap.engine.evidence import evaluate_evidence, gains
 from avtorch.gap.engine.force_base import prices, resized, with_force_map
-from avtorch.gap.engine.gauss_newton import fit, objective
+from avtorch.gap.engine.gauss_newton import fit, objective, penalty
 from avtorch.gap.engine.gear_shifts import refined_shift_speeds, shift_speeds, upshift_rows
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.lost_messages import with_lost_messages
-from avtorch.gap.engine.priors import WITHIN_NATS
+from avtorch.gap.engine.priors import TRIED_NATS, WITHIN_NATS
 from avtorch.gap.engine.promises import later_than_the_start, promises
 from avtorch.gap.engine.recorder import traded
 
@@ -33,6 +33,7 @@ _MOST_FITS, _FEWEST_FITS = 160, 40  # of a search; a hard case of five minutes t
 _GRID_FITS = 4e6  # fits times grid points: what a long drive may cost
 _WIDTH, _LATER_WIDTH, _SECOND_WIDTH = 9, 6, 4  # effects fitted from the base, from a set, on a second way in
 _FINISHED = 3  # of these, how many are finished
+_BISECTIONS = 3  # of the weight of fast bands
 _RAMPS = 10  # of a gain that changes, from a second to the drive's length
 _LEAST_PROMISE = 1.5  # nats: less is the gain of a parameter that does nothing
 _SLOW_MPS = 3.0
@@ -232,7 +233,27 @@ class Search:
             h = other_ramp(h)
         for e in list(h.onsets):
             h = refined_onset(h, e)
-        return h
+        return self._claiming(h)
+
+    def _claiming(self, h: Hypothesis) -> Hypothesis:
+        """The hypothesis where the lesser gain of two bands, which the evidence counts, is largest.
+
+        A fit climbs all bands. Where those below 10 Hz gain less, bands above count less: of two concave gains the
+        lesser is largest where some weighted mean of both is, and the weight is bisected.
+        """
+        best, low, high = h, 0.0, 1.0
+        claim, whole = gains(h)
+        if claim > whole - TRIED_NATS:
+            return h
+        for _ in range(_BISECTIONS):
+            self.fits += 1
+            upper = 0.5 * (low + high)
+            new = fit(best.copy(), 10, upper=upper)
+            claim, whole = gains(new)
+            low, high = (low, upper) if claim < whole else (upper, high)
+            if min(claim, whole) + penalty(new, new.free) > min(gains(best)) + penalty(best, best.free):
+                best = new
+        return best
 
     def _set_in_later(self, found: Sequence[Hypothesis]) -> Iterator[Hypothesis]:
         """The same sets with the last effect from a time on, where that promises more: one that is fitted over the
