@@ -6,7 +6,7 @@ is its effects by name. But an effect may be an error of the shape of the others
 free form may be that, too, or a cause without a name, `unknown`. Beside names a free form is a part without one, or all
 of them together describe one unknown cause: one cause is likelier than several, and a term of a description is cheaper
 than a cause. If the base has a force map, the map is such a part, and the label is `unknown` where nothing else is
-named. Labels add up what supports them:
+named; where named effects explain as much as the map, they win. Labels add up what supports them:
 
     P(label) ~ sum exp(TEMPER (log evidence + log odds))
 """
@@ -250,9 +250,16 @@ def average(
 ) -> ModelAverage:
     """The model average over examined hypotheses. `effects`: names that a label may hold; `most` of them; `prior`:
     weights of causes by name, 1 where not given; of `"pair"` for several at once."""
-    weights = [w for x in examined for w in _weights(x, examined)]
+    allowed = None if effects is None else {*effects, "none", "unknown"}
+    named = [
+        x.hypothesis
+        for x in examined
+        if x.hypothesis.force is None
+        and (allowed is None or set(x.hypothesis.names) <= allowed)
+        and (most is None or len(x.hypothesis.names) <= most)
+    ]
+    weights = [w for x in examined if not _named_as_well(x.hypothesis, named) for w in _weights(x, examined)]
     if effects is not None or most is not None:
-        allowed = None if effects is None else {*effects, "none", "unknown"}
         # what chance decides and nobody asked for is noise
         nameless = set() if effects is None else {*SLOW, "outliers"} - {*effects}
         weights = [replace(w, label=_renamed(w, nameless)) for w in weights]
@@ -398,6 +405,15 @@ def _set_in(c: Composition, late: tuple[SlowOnset, SlowOnset], beside: tuple[Slo
         total["road_grade"] += road.nats
         slow = replace(slow, road_sd=road.sd, road_length=road.scale)
     return replace(c, total=total, slow=slow, gust_onset=gust.time, road_onset=road.time)
+
+
+def _named_as_well(h: Hypothesis, named: list[Hypothesis]) -> bool:
+    """Whether one of the sets without a force map explains as much as the force map of `h`, by the names that `h` has
+    and others that are curves of the map."""
+    if h.force is None:
+        return False
+    own, curves = set(h.names), {*h.names, *h.force.takes_up}
+    return any(own < set(y.names) and set(y.names) <= curves and y.evidence >= h.evidence for y in named)
 
 
 def _weights(x: Examined, examined: list[Examined]) -> Iterator[Weight]:

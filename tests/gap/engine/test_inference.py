@@ -38,6 +38,7 @@ FEW = ("dead_time", "constant_resistance", "sensor_bias")
 TWO = ("dead_time", "constant_resistance")
 ORCHARD = {"easy": 1987222009, "hard": 2448648320}  # sets of a trial in which these cases were answered wrongly
 QUARRY = {"easy": 3068626545, "hard": 540774168}
+GRANITE = {"easy": 4063323681}
 
 
 def found_in(log: Log, effects: Sequence[str | type[Effect]], **options: Any) -> Diagnosis:
@@ -364,6 +365,17 @@ def test_neither_an_echo_nor_a_late_gust_is_an_unknown_cause(index: int, tier: s
     and as much backwards in time. A gust that sets in: what is louder later was louder while driving, once more."""
     case = draw_case(index, QUARRY[tier], tiers=(tier,))
     assert infer(DriveData.of(case.log())).average.label == case.truth_name
+
+
+@pytest.mark.slow
+def test_names_win_where_they_explain_as_much() -> None:
+    """Any R(v) explained no more than resistance and drag do, and was `unknown` at .75, as one form is cheaper than two
+    names."""
+    case = draw_case(3, GRANITE["easy"], tiers=("easy",))
+    assert case.truth_name == "aerodynamic_drag+constant_resistance"
+    found = infer(DriveData.of(case.log())).average
+    assert found.label == case.truth_name
+    assert found.force_maps == {}
 
 
 def test_the_damping_of_a_ring_is_fitted() -> None:
