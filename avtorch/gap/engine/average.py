@@ -3,10 +3,11 @@
 Beside its effects every hypothesis may have a slow random force (gust or road), outliers of the accelerometer, and a
 free form of some family; all are valued in nats of the same likelihood. Each such composition supports labels. Its own
 is its effects by name. But an effect may be an error of the shape of the others, and then the label is without it; a
-free form may be that, too, or a cause without a name, `unknown`. Beside names a free form is a part without one, or all
-of them together describe one unknown cause: one cause is likelier than several, and a term of a description is cheaper
-than a cause. If the base has a force map, the map is such a part, and the label is `unknown` where nothing else is
-named; where named effects explain as much as the map, they win. Labels add up what supports them:
+free form may be that, too, or a cause without a name, `unknown`. A free form beside names is one more cause, without a
+name; or there is a single unknown cause, which the names and the form describe together, and a name that only
+describes costs less than one that is a cause. If the base has a force map, the map is such a part, and the label is
+`unknown` where nothing else is named; where named effects explain as much as the map, they win. Labels add up what
+supports them:
 
     P(label) ~ sum exp(TEMPER (log evidence + log odds))
 """

@@ -136,15 +136,16 @@ class Effect:
     a drive and not to the car. `memory`, `random`: whether it has `advance` and `noise`, which need not be said.
 
     Example:
+        >>> import torch
         >>> from dataclasses import dataclass
         >>> from avtorch.gap import Effect, Parameter, plant
         >>> @dataclass(frozen=True)
         ... class Trailer(Effect):
         ...     mass_ratio: float = 0.4
-        ...     name, place, meaning, equation = "trailer", "actuator", "an unknown trailer", "K_L / (1 + m)"
+        ...     name, place, meaning, equation = "trailer", "actuator", "an unknown trailer", "K_L / (1 + m), pulling"
         ...     parameters = (Parameter("mass_ratio", "-", neutral=0.0, low=0.1, high=0.8),)
         ...     def apply(self, x, row):
-        ...         return 1 / (1 + self.mass_ratio), 1.0  # factors on K_L and T_L
+        ...         return torch.where(x > 0, 1 / (1 + torch.as_tensor(self.mass_ratio)), 1.0), 1.0  # on K_L and T_L
         >>> sorted(plant([Trailer(0.3)]).parameters())
         ['K_L', 'T_L', 'trailer.mass_ratio']
     """
