@@ -48,6 +48,7 @@ from avtorch.gap.engine.priors import (
     UNKNOWN_NATS,
     WITHIN_NATS,
 )
+from avtorch.gap.engine.pulling_lags import PullingLags, pulling_lags
 from avtorch.gap.engine.roughness import SIGNS, roughness
 from avtorch.gap.engine.search import Search
 from avtorch.gap.engine.shape_error import relative_size, shape_likelihood, shape_log_odds, shape_log_prior
@@ -55,7 +56,6 @@ from avtorch.gap.engine.slow_forces import (
     SlowForces,
     SlowOnset,
     cycle_response,
-    pulling_lags,
     sensors_by_frame,
     slow_forces,
     slow_onset,
@@ -330,7 +330,7 @@ def _from_the_start(h: Hypothesis) -> np.ndarray:
 
 
 def _composed(
-    h: Hypothesis, form: str, nats: float, residual: np.ndarray, exact: float, lags: np.ndarray, least: float = -np.inf
+    h: Hypothesis, form: str, nats: float, residual: np.ndarray, exact: float, lags: PullingLags, least: float = -np.inf
 ) -> Composition | None:
     """Slow forces beside a free form that has left `residual`, at every error of the effects' shape."""
     data = h.data
@@ -388,7 +388,7 @@ def _rough(h: Hypothesis, plain: Composition, form: str) -> Composition | None:
     return replace(plain, form=form, nats=nats, relative=relative, total=total)
 
 
-def _late_forces(h: Hypothesis, residual: FloatArray, lags: FloatArray) -> tuple[SlowOnset, SlowOnset]:
+def _late_forces(h: Hypothesis, residual: FloatArray, lags: PullingLags) -> tuple[SlowOnset, SlowOnset]:
     """A gust and a road that set in during the drive."""
     whole = slow_forces(h.data, residual, _from_the_start(h), lags=lags, sensors=sensors_by_frame(h))
     return slow_onset(h.data, residual, whole, "gust"), slow_onset(h.data, residual, whole, "road")

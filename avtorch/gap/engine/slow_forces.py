@@ -40,6 +40,7 @@ from avtorch.gap.engine.drive_data import DriveData
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance
 from avtorch.gap.engine.priors import BAND_RATIO, ONSET_ODDS
+from avtorch.gap.engine.pulling_lags import PullingLags
 
 # priors: log-normal, by mean and standard deviation of the logarithm
 PROCESS_NOISE = (0.03, 0.8)
@@ -70,13 +71,9 @@ CYCLE_HZ = (0.2, 1.9)
 """Frequencies of cycles [Hz], in half bands: at 20 m/s a road has slower ones, of waves of 100 m and more."""
 SENSORS = [INDEX["sensor_lag"], INDEX["speed_lag"], INDEX["sensor_scale"]]
 """Coordinates of readings that show late, or larger, what pushes the car."""
-PULLING_LAG_RATIOS = 2.0 ** np.arange(6)
-"""Lags over the actuator's own, by which a saturated actuator pulls back what disturbs it [-]."""
 ONSET_SHARES = (0.12, 0.85)
 """Shares of a drive's frames between which a gust may set in: both parts show what they hold."""
 
-AT_LIMIT = 0.97
-"""Share of the limit of jerk from which on it is at work [-]: a filter of the recorder rounds its corners."""
 ROAD_STEEPNESS = 8
 """Order of the end of a road's spectrum [-]: steep, like that of a curve with continuous curvature."""
 SENSOR_ALONE_HZ = 0.5
@@ -96,9 +93,9 @@ class SlowForces:
 
     `cycle` [nats], its `cycle_sd` [m/s²] and `cycle_hz`: likewise; no nats where it was not asked for.
 
-    `process_power` (band,) [(m/s²)²] at the best gust; `covariance` (band, channel, channel) and `counts`
-    (band,) are what was explained; `sensor` (channel, frame, band): factors by which a residual becomes that before a
-    sensor that lags or has another scale.
+    `process_power`, `process_power_beside_road` (band,) [(m/s²)²] at the best gust and road; `covariance`
+    (band, channel, channel) and `counts` (band,) are what was explained; `sensor` (channel, frame, band): factors by
+    which a residual becomes that before a sensor that lags or has another scale.
     """
 
     log_likelihood: float
@@ -113,6 +110,7 @@ class SlowForces:
     road_sd: float
     road_length: float
     process_power: FloatArray = field(repr=False)
+    process_power_beside_road: FloatArray = field(repr=False)
     covariance: FloatArray = field(repr=False)
     counts: FloatArray = field(repr=False)
     sensor: FloatArray = field(repr=False)
@@ -255,28 +253,12 @@ def sensors_by_frame(h: Hypothesis) -> FloatArray:
     return np.where(acts, h.values[SENSORS, None], h.neutral[SENSORS, None])
 
 
-def pulling_lags(h: Hypothesis) -> FloatArray:
-    """Lags (lag,) [s] by which the actuator of a hypothesis may pull back what disturbs the car.
-
-    Its own; while a limit of jerk is at work it does not answer, and process noise goes on for longer.
-    """
-    lag, inverse_jerk = h["T_L"], h["inverse_jerk"]
-    if inverse_jerk <= 0 or h.data.accel is None:
-        return np.array([lag])
-    values = h.values.copy()
-    values[[INDEX["accel_delay"], INDEX["accel_filter"]]] = 0.0
-    slope = np.diff(h.rows(values)[0]) / np.diff(h.data.time)
-    most = np.where(slope > 0, 1.0, np.exp(h["log_fall"])) / inverse_jerk
-    limited = float((np.abs(slope) > AT_LIMIT * most).mean())
-    return np.asarray(lag * (1 + limited * (PULLING_LAG_RATIOS - 1)), float)
-
-
 def slow_forces(
     data: DriveData,
     residual: FloatArray,
     values: FloatArray,
     given: tuple[FloatArray, FloatArray] | None = None,
-    lags: FloatArray | None = None,
+    lags: PullingLags | None = None,
     *,
     sensors: FloatArray | None = None,
     cycle: bool = False,
@@ -286,7 +268,8 @@ def slow_forces(
     With `cycle`, a cycle too. `sensors` (3, frame), see `sensors_by_frame`: those of `values` where not given.
 
     `given`: covariance (band, channel, channel) and counts (band,) in place of the residual's; bands beyond `SLOW_HZ`
-    are ignored. `lags` (lag,) [s], see `pulling_lags`: the likeliest counts; T_L where not given.
+    are ignored. `lags`, see `pulling_lags`: the likeliest counts; T_L where not given. A gust or a road stands beside
+    process noise of that lag, or of the one that the response prefers.
     """
     frequency, energy = data.band_response
     bands = len(energy)
@@ -305,20 +288,30 @@ def slow_forces(
             return _road_in_the_speed(data, covariance, counts, force, road).sum(-1)
         return wishart_profile(covariance, counts, force + road)[0].sum(-1)
 
-    lags = np.atleast_1d(values[INDEX["T_L"]] if lags is None else lags)
-    spectra = process_spectrum(frequency, lags)
+    lag, lost = lags or PullingLags(values[INDEX["T_L"]][None], np.zeros(1))
+    spectra = process_spectrum(frequency, lag)
     if values[INDEX["square_period"]] > 0:  # a second pole is passed by what disturbs the actuator, not the body
-        spectra = np.concatenate([spectra, process_spectrum(frequency, lags, values[INDEX["square_period"]])])
+        spectra = np.concatenate([spectra, process_spectrum(frequency, lag, values[INDEX["square_period"]])])
+        lost = np.concatenate([lost, lost])
     unit = spectra @ energy.T
-    process = PROCESS_NOISE_GRID[:, None] ** 2 * unit[:, None]  # (lag, size, band)
-    alone = nats(process) + _log_normal(PROCESS_NOISE_GRID, PROCESS_NOISE)
-    lag, most = np.unravel_index(np.argmax(alone), alone.shape)
-    # long drives know the size better than the grid: what is between its points would pass for a gust
-    fine = PROCESS_NOISE_GRID[most] * np.geomspace(1 / _GRID_RATIO, _GRID_RATIO, 13)
-    alone = nats(fine[:, None] ** 2 * unit[lag]) + _log_normal(fine, PROCESS_NOISE)
-    base, size = float(alone.max()), float(fine[np.argmax(alone)])
-    sizes = size / _GRID_RATIO ** np.array(PROCESS_NOISE_STEPS)
-    process, prior = sizes[:, None] ** 2 * unit[lag], _log_normal(sizes, PROCESS_NOISE)
+    coarse = nats(PROCESS_NOISE_GRID[:, None] ** 2 * unit[:, None]) + _log_normal(PROCESS_NOISE_GRID, PROCESS_NOISE)
+    coarse += lost[:, None]  # (lag, size)
+
+    def alone(i: int) -> tuple[float, float]:
+        """Nats of process noise pulled back by one of the lags, and its size."""
+        # long drives know the size better than the grid: what is between its points would pass for a gust
+        fine = PROCESS_NOISE_GRID[coarse[i].argmax()] * np.geomspace(1 / _GRID_RATIO, _GRID_RATIO, 13)
+        total = nats(fine[:, None] ** 2 * unit[i]) + _log_normal(fine, PROCESS_NOISE) + lost[i]
+        return float(total.max()), float(fine[total.argmax()])
+
+    likeliest = int(coarse.max(1).argmax())
+    base, size = alone(likeliest)
+    own = np.flatnonzero(lost == 0)
+    chosen = sorted({likeliest, int(own[coarse[own].max(1).argmax()])})
+    steps = _GRID_RATIO ** -np.array(PROCESS_NOISE_STEPS, float)
+    sizes = np.concatenate([alone(i)[1] * steps for i in chosen])
+    of_lag = np.repeat(chosen, len(steps))
+    process, prior = sizes[:, None] ** 2 * unit[of_lag], _log_normal(sizes, PROCESS_NOISE) + lost[of_lag]
 
     def best(
         unit: FloatArray, sizes: tuple[float, float], shape_prior: FloatArray, *, road: bool = False
@@ -347,6 +340,7 @@ def slow_forces(
         road_sd=float(SIZE_GRID_MPS2[r1]),
         road_length=float(ROAD_LENGTH_GRID_M[r2]),
         process_power=process[g0],
+        process_power_beside_road=process[r0],
         covariance=covariance,
         counts=counts,
         sensor=sensor,
@@ -355,6 +349,7 @@ def slow_forces(
         return found
     lines = np.geomspace(*CYCLE_HZ, 1 + round(math.log(CYCLE_HZ[1] / CYCLE_HZ[0]) / (0.5 * math.log(BAND_RATIO))))
     cycles = cycle_spectrum(frequency, lines) @ energy.T
+    prior = np.where(of_lag == of_lag[g0], prior, -np.inf)  # of the lag that `process_power` has
     # one of so many bands: two lines a band are not two
     gain, (c0, c1, c2) = best(cycles, CYCLE_SD_MPS2, np.full(len(lines), -math.log(len(lines) / 2)))
     return replace(
@@ -414,17 +409,17 @@ def slow_onset(
     if frames < 10 or (kind == "road" and data.accel_kind == "specific-force"):
         return SlowOnset(0.0)
     frequency, energy = data.band_response
-    unit = found.process_power / found.process_noise_beside_gust**2
-    process = PROCESS_NOISE_GRID[:, None] ** 2 * unit
     of_process = _log_normal(PROCESS_NOISE_GRID, PROCESS_NOISE)
     if kind == "gust":
         scales, of_size, of_scale = GUST_TIME_GRID_S, GUST_SD_MPS2, GUST_TIME_S
         spectra, best = gust_spectrum(frequency, scales), (found.gust_sd, found.gust_time)
-        beside = found.process_noise_beside_gust
+        beside, power = found.process_noise_beside_gust, found.process_power
     else:
         scales, of_size, of_scale = ROAD_LENGTH_GRID_M, ROAD_SD_MPS2, ROAD_LENGTH_M
         spectra, best = road_spectrum(frequency, _mean_speed(data) / scales), (found.road_sd, found.road_length)
-        beside = found.process_noise_beside_road
+        beside, power = found.process_noise_beside_road, found.process_power_beside_road
+    unit = power / beside**2
+    process = PROCESS_NOISE_GRID[:, None] ** 2 * unit
     shapes = spectra @ energy.T
     force = (SIZE_GRID_MPS2[:, None, None] ** 2 * shapes).reshape(-1, found.bands)
     of_force = (_log_normal(SIZE_GRID_MPS2, of_size)[:, None] + _log_normal(scales, of_scale)).ravel()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -11,9 +13,11 @@ from avtorch import Log
 from avtorch.arrays import FloatArray
 from avtorch.gap.engine.coordinates import INDEX, NEUTRAL
 from avtorch.gap.engine.drive_data import DriveData
+from avtorch.gap.engine.evidence import evaluate_evidence
 from avtorch.gap.engine.hypothesis import Hypothesis
 from avtorch.gap.engine.likelihood import band_covariance
 from avtorch.gap.engine.priors import BAND_RATIO, SLOW_HZ
+from avtorch.gap.engine.pulling_lags import PullingLags, limited_lags, pulling_lags
 from avtorch.gap.engine.slow_forces import (
     GUST_TIME_GRID_S,
     PROCESS_NOISE_GRID,
@@ -22,7 +26,6 @@ from avtorch.gap.engine.slow_forces import (
     cycle_spectrum,
     gust_spectrum,
     process_spectrum,
-    pulling_lags,
     road_spectrum,
     sensors_by_frame,
     slow_forces,
@@ -31,6 +34,7 @@ from avtorch.gap.engine.slow_forces import (
     wishart_profile,
 )
 from tests.bars import BAR, log_odds, student
+from tests.gap.engine.recorded import fitted_hypothesis, recorded_log
 
 RATE_HZ = 20
 SPEED_MPS = 15.0
@@ -307,15 +311,48 @@ def test_what_is_given_replaces_the_residuals(fresh_seed: int) -> None:
     assert own.log_likelihood + max(own.gust, own.road, 0.0) < free
 
 
-# lags of an actuator at its limit -------------------------------------------------------------------------------------
+# lags by which an actuator pulls back what disturbs the car -----------------------------------------------------------
+@pytest.mark.statistical
+def test_process_noise_under_a_lag_that_is_too_short_is_no_gust(rotating_seed: int) -> None:
+    """Where the response hardly tells the lag, the noise does: the loss of another lag is weighed against it."""
+    rng, data = np.random.default_rng(rotating_seed), _data(300)
+    residual = _residual(data, rng, _process_noise(rng, len(data.time), 0.2))
+    values = NEUTRAL.copy()
+    values[INDEX["T_L"]] = 0.1 * T_L
+
+    def gust(loss: float) -> float:
+        lags = PullingLags(np.array([0.1 * T_L, T_L]), np.array([0.0, -loss]))
+        return slow_forces(data, residual, values, lags=lags).gust
+
+    # a likelihood ratio against what is true exceeds x nats in exp(-x) of all drives; the grids leave some more
+    assert gust(5.0) < 8
+    alone = gust(1e4)
+    assert alone == pytest.approx(slow_forces(data, residual, values).gust)
+    assert alone > 20
+
+
+def test_lags_that_explain_the_response_as_well_are_tried(fresh_seed: int) -> None:
+    log, rng = recorded_log(seed=fresh_seed), np.random.default_rng(fresh_seed)
+    assert log.accel is not None
+    assert log.speed is not None
+    rough = replace(log, accel=log.accel + rng.normal(0, 1.5, log.rows), speed=log.speed + rng.normal(0, 0.3, log.rows))
+    known, unknown = (pulling_lags(evaluate_evidence(fitted_hypothesis(x))) for x in (log, rough))
+    assert len(known.lag) == 1
+    assert len(unknown.lag) > 3
+    for lags in (known, unknown):
+        assert lags.nats[0] == 0
+        assert (lags.nats <= 0).all()
+        assert len(set(lags.lag)) == len(lags.lag)
+
+
 def test_an_actuator_at_its_limit_pulls_less() -> None:
     data = _data(60)
     free = Hypothesis(data)
-    assert pulling_lags(free).tolist() == [T_L]
+    assert limited_lags(free).tolist() == [T_L]
     # steepest demand: 2 pi / 10 m/s³; limits from never reached to reached nearly always
     shares = []
     for jerk in (1.0, 0.5, 0.1):
-        lags = pulling_lags(free.with_effect("rate_limit", (1 / jerk, 0.0)))
+        lags = limited_lags(free.with_effect("rate_limit", (1 / jerk, 0.0)))
         assert lags[0] == pytest.approx(T_L)
         shares.append((lags[1] / T_L - 1) / (2 - 1))
         assert np.allclose(lags, T_L * (1 + shares[-1] * (2.0 ** np.arange(len(lags)) - 1)))
