@@ -33,6 +33,7 @@ from avtorch.gap.engine.free_forms import (
 )
 from avtorch.gap.engine.gauss_newton import fit, prior_terms, slopes_of, whitened_jacobian
 from avtorch.gap.engine.hypothesis import Hypothesis
+from avtorch.gap.engine.inference import infer
 from avtorch.gap.engine.likelihood import log_likelihood, whiten
 from avtorch.gap.engine.roughness import SIGNS, roughness
 
@@ -83,6 +84,11 @@ def _pulsing_brakes(time: FloatArray, u: FloatArray) -> FloatArray:
     return _lagged(GAIN * np.where(off, 0.6, 1.0) * u)
 
 
+def _uneven_brakes(time: FloatArray, u: FloatArray) -> FloatArray:
+    pulse = 1.0 + 0.2 * np.sign(np.sin(2 * np.pi * (1.0 + 0.005 * time) * time))  # no cycle: 1 to 2.5 Hz
+    return _lagged(GAIN * np.where(u < -0.5, pulse, 1.0) * u)
+
+
 def _wandering_delay(time: FloatArray, u: FloatArray) -> FloatArray:
     late = 0.1 + 0.1 * np.sin(2 * np.pi * time / 60.0)
     return np.interp(time - late, time, _lagged(GAIN * u))
@@ -97,9 +103,8 @@ def _foreseeing_drive(time: FloatArray, u: FloatArray) -> FloatArray:
     return _lagged(GAIN * np.minimum(u, 0.0)) + 0.8 * _lagged(GAIN * up) + 0.2 * _lagged(GAIN * up[::-1])[::-1]
 
 
-@cache
-def _car(response: Force, channels: tuple[str, ...] = ("accel", "speed"), seed: int = 0) -> Hypothesis:
-    """The hypothesis without effects, fitted to a car with this response to an open-loop command."""
+def _drive(response: Force, channels: tuple[str, ...] = ("accel", "speed"), seed: int = 0, bias: float = 0.0) -> Log:
+    """A car with this response to an open-loop command, and a bias of its accelerometer [m/s²]."""
     random = np.random.default_rng(seed)
     time = np.arange(0.0, SECONDS, DT)
     command = gaussian_filter1d(np.repeat(random.normal(0.0, 1.3, len(time)), 150)[: len(time)], 20)
@@ -108,11 +113,16 @@ def _car(response: Force, channels: tuple[str, ...] = ("accel", "speed"), seed: 
     speed = 40.0 + np.cumsum(np.append(0.0, 0.5 * (accel[1:] + accel[:-1]))) * DT
     speed += 20.0 - speed.min()  # never near standstill
     readings = {
-        "accel": accel + random.normal(0.0, ACCEL_SD, len(time)),
+        "accel": bias + accel + random.normal(0.0, ACCEL_SD, len(time)),
         "speed": speed + random.normal(0.0, SPEED_SD, len(time)),
     }
-    data = DriveData.of(Log.from_arrays(time=time, accel_cmd=command, **{c: readings[c] for c in channels}))
-    return _fitted(data)
+    return Log.from_arrays(time=time, accel_cmd=command, **{c: readings[c] for c in channels})
+
+
+@cache
+def _car(response: Force, channels: tuple[str, ...] = ("accel", "speed"), seed: int = 0) -> Hypothesis:
+    """The hypothesis without effects, fitted to such a car."""
+    return _fitted(DriveData.of(_drive(response, channels, seed)))
 
 
 def _fitted(data: DriveData) -> Hypothesis:
@@ -293,6 +303,14 @@ def test_brakes_that_pulse_are_a_force_while_braking() -> None:
     done = np.sum((h.residual - found["rough_braking"].residual) ** 2, axis=(0, 2))
     braked = demand_response(h, np.minimum(h.command(), 0.0)[None], np.array([LAG]))[0, 0]
     assert np.corrcoef(done, np.sum(braked**2, axis=-1))[0, 1] > 0.5
+
+
+def test_no_name_describes_what_chance_does() -> None:
+    """A biased accelerometer and brakes that pulse about their mean were one unknown cause."""
+    log = _drive(_uneven_brakes, bias=0.3)
+    found = infer(DriveData.of(log), effects=("sensor_bias", "dead_time")).average
+    assert found.label == "sensor_bias"
+    assert found.parts["rough_braking"] > 0.5
 
 
 def test_dynamics_of_one_reading_are_the_sensors() -> None:
