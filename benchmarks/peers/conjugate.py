@@ -17,13 +17,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, Posterior
 from avtorch.inference.device import check_generator
-from benchmarks.peers.contract import Answer, Settings
+from benchmarks.peers.contract import Answer
+from benchmarks.peers.own import OwnDensity, density_of
 from benchmarks.peers.problem import Windows
-from benchmarks.peers.torch_rows import density_of, own_log_density
 
 #: Variance of the conjugate prior over that of the intended prior: the proposal must have the wider tails.
 WIDENING = 4.0
@@ -181,18 +180,8 @@ class _NormalInverseGamma:
         return normal + inverse_gamma - self.rate / variance
 
 
-class Runner:
-    def __init__(self, settings: Settings) -> None:
-        self.settings = settings
-
-    def log_density(self, windows: Windows, z: FloatArray) -> FloatArray:
-        return own_log_density(windows, z)
-
+class Runner(OwnDensity):
     def run(self, windows: Windows, seed: int) -> Answer:
         generator = torch.Generator().manual_seed(seed)
         found = sample_conjugate(density_of(windows), generator=generator, **self.settings)
         return Answer(found.posterior.draws.numpy(), ess=found.ess.numpy())
-
-
-def build(settings: Settings) -> Runner:
-    return Runner(settings)

@@ -54,7 +54,7 @@ class Method:
     Attributes:
         name: how ``--only`` names it.
         title: how the table names it.
-        module: under ``benchmarks.peers``; its ``build(settings)`` returns a :class:`Runner`.
+        runner: module and class of its :class:`Runner` under ``benchmarks.peers``.
         needs: modules that must be installed, and ``pip``: what installs them.
         candidates: settings for one window; of several the run keeps the fastest that is accurate, on windows of its
             own. ``draws`` (a chain), or what else ``scales`` names, is then scaled so that the worst parameter gets the
@@ -69,7 +69,7 @@ class Method:
 
     name: str
     title: str
-    module: str
+    runner: str
     needs: tuple[str, ...] = ()
     pip: str = ""
     candidates: tuple[Settings, ...] = ({},)
@@ -87,7 +87,8 @@ class Method:
         return tuple(name for name in self.needs if find_spec(name) is None)
 
     def build(self, settings: Settings) -> Runner:
-        return import_module(f"benchmarks.peers.{self.module}").build(settings)
+        module, _, runner = self.runner.partition(".")
+        return getattr(import_module(f"benchmarks.peers.{module}"), runner)(settings)
 
 
 def moments(answer: Answer) -> tuple[FloatArray, FloatArray]:

@@ -10,7 +10,7 @@ _ALL = (
     Method(
         "avtorch",
         "avtorch SGLD, default",
-        "avtorch_sgld",
+        "own.SGLD",
         fixed=True,
         batch={},
         gets="`sample` with default settings, its walk compiled where numba is installed; sums, closed-form gradient",
@@ -18,7 +18,7 @@ _ALL = (
     Method(
         "avtorch-eager",
         "avtorch SGLD, eager torch",
-        "avtorch_sgld",
+        "own.SGLD",
         candidates=({"chains": 320, "walk": "eager"},),
         scales="chains",
         batch={"chains": 320, "walk": "eager"},
@@ -27,7 +27,7 @@ _ALL = (
     Method(
         "avtorch-matched",
         "avtorch SGLD, chains for 2000 ESS",
-        "avtorch_sgld",
+        "own.SGLD",
         candidates=({"chains": 320}, {"chains": 1280, "draws": 4, "thinning": 1}),
         scales="chains",
         batch={"chains": 320},
@@ -36,7 +36,7 @@ _ALL = (
     Method(
         "blackjax-nuts",
         "BlackJAX NUTS, tuned",
-        "blackjax_nuts",
+        "blackjax_nuts.Runner",
         needs=_JAX,
         pip="pip install jax blackjax",
         candidates=(
@@ -52,7 +52,7 @@ _ALL = (
     Method(
         "blackjax-nuts-stan",
         "BlackJAX NUTS, Stan's warm-up",
-        "blackjax_nuts",
+        "blackjax_nuts.Runner",
         needs=_JAX,
         pip="pip install jax blackjax",
         candidates=({"chains": 1, "warmup": 1000, "draws": 3000},),
@@ -62,7 +62,7 @@ _ALL = (
     Method(
         "blackjax-nuts-low-rank",
         "BlackJAX NUTS, low-rank warm-up",
-        "blackjax_nuts",
+        "blackjax_nuts.Runner",
         needs=_JAX,
         pip="pip install jax blackjax",
         candidates=({"low_rank": True, "chains": 1, "warmup": 300, "draws": 3000},),
@@ -71,7 +71,7 @@ _ALL = (
     Method(
         "blackjax-mclmc",
         "BlackJAX MCLMC, low-rank warm-up",
-        "blackjax_mclmc",
+        "blackjax_mclmc.Runner",
         needs=_JAX,
         pip="pip install jax blackjax",
         candidates=({"kind": "low-rank", "pilot": 500, "samples": 1000, "warmup": 500, "draws": 5000},),
@@ -81,7 +81,7 @@ _ALL = (
     Method(
         "blackjax-laps",
         "BlackJAX LAPS",
-        "blackjax_mclmc",
+        "blackjax_mclmc.Runner",
         needs=_JAX,
         pip="pip install jax blackjax",
         candidates=({"kind": "laps", "burn_in": 300, "adjusted": 600, "chains": 2048},),
@@ -92,7 +92,7 @@ _ALL = (
     Method(
         "blackjax-nuts-mode",
         "BlackJAX NUTS, from our mode",
-        "blackjax_nuts",
+        "blackjax_nuts.Runner",
         needs=_JAX,
         pip="pip install jax blackjax",
         candidates=(
@@ -106,7 +106,7 @@ _ALL = (
     Method(
         "blackjax-nuts-whitened",
         "BlackJAX NUTS, in our whitened space",
-        "blackjax_nuts",
+        "blackjax_nuts.Runner",
         needs=_JAX,
         pip="pip install jax blackjax",
         candidates=(
@@ -120,7 +120,7 @@ _ALL = (
     Method(
         "blackjax-sgld",
         "BlackJAX SGLD, 64 chains, whitened by us",
-        "blackjax_sgld",
+        "blackjax_sgld.Runner",
         needs=_JAX,
         pip="pip install jax blackjax",
         candidates=tuple(
@@ -141,7 +141,7 @@ _ALL = (
     Method(
         "blackjax-sgld-plain",
         "BlackJAX SGLD, 64 chains, as it comes",
-        "blackjax_sgld",
+        "blackjax_sgld.Runner",
         needs=_JAX,
         pip="pip install jax blackjax",
         candidates=(
@@ -161,7 +161,7 @@ _ALL = (
     Method(
         "numpyro-nuts",
         "NumPyro NUTS",
-        "numpyro_nuts",
+        "numpyro_nuts.Runner",
         needs=("jax", "numpyro"),
         pip="pip install numpyro",
         candidates=(
@@ -175,7 +175,7 @@ _ALL = (
     Method(
         "nutpie",
         "nutpie",
-        "nutpie_nuts",
+        "nutpie_nuts.Runner",
         needs=("nutpie", "pymc", "numba"),
         pip="pip install nutpie pymc numba",
         candidates=(
@@ -188,7 +188,7 @@ _ALL = (
     Method(
         "walnuts",
         "WALNUTS (walnutpie)",
-        "walnuts",
+        "walnuts.Runner",
         needs=("walnutpie", "numba"),
         pip="pip install walnutpie numba",
         candidates=tuple({"chains": 1, "warmup": warmup, "draws": 2500} for warmup in (100, 300)),
@@ -198,7 +198,7 @@ _ALL = (
     Method(
         "pyro-nuts",
         "Pyro NUTS",
-        "pyro_nuts",
+        "own.PyroNUTS",
         needs=("pyro",),
         pip="pip install pyro-ppl",
         candidates=({"chains": 1, "warmup": 300, "draws": 2500},),
@@ -209,7 +209,7 @@ _ALL = (
     Method(
         "posteriors",
         "posteriors SGLD, 64 chains",
-        "posteriors_sgld",
+        "posteriors_sgld.Runner",
         needs=("posteriors",),
         pip="pip install posteriors",
         candidates=({"step": 0.3, "chains": 64, "burn_in": 20, "thinning": 4, "draws": 250},),
@@ -219,7 +219,7 @@ _ALL = (
     Method(
         "scalar",
         "scalar SGLD loop, whitened",
-        "scalar_sgld",
+        "scalar_sgld.Runner",
         candidates=({"whitened": True, "step": 0.3, "burn_in": 100, "draws": 4000},),
         fixed=True,
         slow=True,
@@ -228,7 +228,7 @@ _ALL = (
     Method(
         "scalar-plain",
         "scalar SGLD loop, one step for all",
-        "scalar_sgld",
+        "scalar_sgld.Runner",
         candidates=({"whitened": False, "step": 0.3, "burn_in": 100, "draws": 4000},),
         fixed=True,
         slow=True,
@@ -237,7 +237,7 @@ _ALL = (
     Method(
         "conjugate",
         "conjugate + importance resampling",
-        "conjugate",
+        "conjugate.Runner",
         candidates=({"draws": 4000, "proposals": 4000},),
         batch={"draws": 4000, "proposals": 4000},
         gets="exact route for this likelihood only: the limit",
@@ -245,7 +245,7 @@ _ALL = (
     Method(
         "laplace",
         "Laplace",
-        "laplace",
+        "own.Laplace",
         fixed=True,
         batch={},
         gets="mode and curvature in the log parameters, log-normal moments; no draws",
@@ -253,7 +253,7 @@ _ALL = (
     Method(
         "ukf",
         "unscented Kalman filter",
-        "ukf",
+        "ukf.Runner",
         needs=("filterpy",),
         pip="pip install filterpy",
         fixed=True,
@@ -263,7 +263,7 @@ _ALL = (
     Method(
         "rls",
         "recursive least squares",
-        "rls",
+        "rls.Runner",
         fixed=True,
         batch={},
         same_density=False,
@@ -272,7 +272,7 @@ _ALL = (
     Method(
         "quadrature",
         "exact quadrature",
-        "quadrature",
+        "own.Quadrature",
         fixed=True,
         batch={},
         batch_windows=100,

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.peers.contract import Method, Settings, as_log
+from benchmarks.peers.own import own_log_density
 from benchmarks.peers.problem import make_windows
 from benchmarks.peers.process import PeerFailed, Worker
 from benchmarks.peers.score import WANTED, Exact, Score, median, seconds_to
-from benchmarks.peers.torch_rows import own_log_density
 
 TRIAL_WINDOWS = 3
 #: Draws are scaled to this many times the effective draws wanted on the worst trial window.
