@@ -23,8 +23,7 @@ from benchmarks.blindtest.drives import draw_drive, with_stops
 from benchmarks.blindtest.oracle_budget import gap_over_floor
 from benchmarks.blindtest.recorder import draw_recorder
 from benchmarks.blindtest.replay import Replay
-from benchmarks.blindtest.several import LEAST_GAP, draw_several, ordinary
-from benchmarks.blindtest.strength import excess_range, solve_strength
+from benchmarks.blindtest.several import LEAST_GAP, draw_several, excess_range, ordinary, solve_strength
 from benchmarks.blindtest.vehicle import Pilot, Run, simulate
 from benchmarks.blindtest.visibility import TIERS, Sight, oracles, sight, tier_of
 

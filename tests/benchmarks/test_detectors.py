@@ -14,8 +14,7 @@ from avtorch.decision.settings import Setting
 from avtorch.errors import InputError
 from benchmarks.detectors.drives import Beliefs
 from benchmarks.detectors.judge import DETECTORS, first_alarm, scores
-from benchmarks.detectors.operating_curves import operating_curve, operating_figure
-from benchmarks.detectors.tables import Quiet, alarms, chosen, delays, found, quiet
+from benchmarks.detectors.tables import Quiet, alarms, chosen, delays, found, operating_curve, operating_figure, quiet
 from benchmarks.options.gap import gap_figure, gap_trade_off
 
 RUNS, WINDOWS = 80, 34

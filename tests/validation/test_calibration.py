@@ -27,9 +27,16 @@ from benchmarks.pooled import (
     truth_given_all,
     windows_of,
 )
-from benchmarks.rank_calibration import RankCalibration, sbc_quadrature
+from benchmarks.rank_calibration import (
+    RankCalibration,
+    bonferroni,
+    chi2_p_value,
+    dispersion_p_value,
+    ecdf_band,
+    ecdf_p_value,
+    sbc_quadrature,
+)
 from benchmarks.sine_windows import sine_commands, statistics
-from benchmarks.uniformity import bonferroni, chi2_p_value, dispersion_p_value, ecdf_band, ecdf_p_value
 from tests.bars import BAR, LEVEL
 
 F64 = torch.float64

@@ -14,8 +14,7 @@ from benchmarks.blindtest.case import Case, write
 from benchmarks.blindtest.cases import draw_case, draw_cases
 from benchmarks.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, family
 from benchmarks.blindtest.deck import MIX, card, kind_of
-from benchmarks.blindtest.several import COUNTS, LEAST_GAP, STRENGTHS, draw_several
-from benchmarks.blindtest.strength import excess_range
+from benchmarks.blindtest.several import COUNTS, LEAST_GAP, STRENGTHS, draw_several, excess_range
 from benchmarks.blindtest.visibility import TIERS
 from tests.bars import BAR
 

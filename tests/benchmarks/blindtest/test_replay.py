@@ -12,7 +12,7 @@ from avtorch.io import Log
 from benchmarks.blindtest import CALIBRATION, EFFECTS, SEALED, Car, DrivePlan, Recorded, Recorder, family, simulate
 from benchmarks.blindtest.oracle_budget import gap_over_floor, oracle_budget
 from benchmarks.blindtest.replay import Replay
-from benchmarks.blindtest.strength import excess_range, solve_strength
+from benchmarks.blindtest.several import excess_range, solve_strength
 from benchmarks.blindtest.vehicle import Run
 from benchmarks.blindtest.visibility import TIERS, exact_gain, oracles, sight, tier_of
 
