@@ -104,13 +104,6 @@ def test_map_distinguishes_the_three_verdicts() -> None:
     assert len({UNSTABLE, AMPLIFIES, STABLE}) == 3
 
 
-def test_map_of_one_verdict_only() -> None:
-    everywhere = np.ones((2, 3), bool)
-    verdict_map(axes(), [0.0, 1.0, 2.0], [0.0, 1.0], everywhere, everywhere, np.ones((2, 3)))
-    nowhere = np.zeros((2, 3), bool)
-    verdict_map(axes(), [0.0, 1.0, 2.0], [0.0, 1.0], nowhere, nowhere, np.full((2, 3), np.inf))
-
-
 def test_the_legend_names_what_is_drawn() -> None:
     x = y = [0.0, 1.0]
     names = []

@@ -27,6 +27,14 @@ def wilson(hits: int, trials: int, level: float = LEVEL) -> Interval | None:
     return low, 1.0 if hits == trials else float(middle + half)
 
 
+def counted(hits: int, of: int) -> str:
+    """How many of how many, with Wilson's 90 % interval of the share."""
+    between = wilson(hits, of)
+    return (
+        f"{hits} of {of}" if between is None else f"{hits} of {of} ({100 * between[0]:.0f} to {100 * between[1]:.0f} %)"
+    )
+
+
 HALF_WIDTH = 0.05
 """Half width of an interval that is narrow enough to quote a figure with: 5 points."""
 

@@ -14,8 +14,7 @@ from avtorch.decision.settings import Setting
 from avtorch.errors import InputError
 from benchmarks.detectors.drives import Beliefs
 from benchmarks.detectors.judge import DETECTORS, first_alarm, scores
-from benchmarks.detectors.tables import Quiet, alarms, chosen, delays, found, operating_curve, operating_figure, quiet
-from benchmarks.options.gap import gap_figure, gap_trade_off
+from benchmarks.detectors.tables import Quiet, chosen, found, operating_curve, operating_figure, quiet
 
 RUNS, WINDOWS = 80, 34
 
@@ -82,34 +81,6 @@ def test_the_readiest_quiet_value_is_chosen() -> None:
     assert picked["kl"] == pytest.approx(10**-2.5)
     assert picked["hellinger"] == 0.1
     assert chosen({"healthy": (beliefs, score)}, 0.1)["kl"] == 0.1
-
-
-def test_tables_have_a_row_a_detector_and_a_column_a_kind() -> None:
-    row = {"detector": "kl", "value": None}
-    none = {"alarmed": 0, "runs": 200, "interval": (0.0, 0.0189), "per_hour": 0.0}
-    late = {"runs": 200, "early": 100, "median_s": 2.0, "soon": 50, "at_all": 100}
-    told = alarms([{**row, "healthy": none}], ["healthy"]).splitlines()
-    assert told == ["| detector | set to | healthy |", "|---|---|---|", "| kl | defaults | 0 % (0.0 to 1.9) |"]
-    assert delays([{**row, "abrupt": late}], ["abrupt"]).endswith("| 2.0 s; 50 %, 100 %; 100 early |")
-    assert "no run without an early alarm" in delays([{**row, "abrupt": {**late, "early": 200}}], ["abrupt"])
-
-
-# What a longer gap buys and costs, and operating curves, as drawn.
-def curve():
-    z = torch.randn(2, 100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    gaps = torch.tensor([1.0, 1.6, 2.0, 2.5], dtype=torch.float64)
-    return gap_trade_off(1.5 * (0.05 * z[0]).exp(), 0.5 * (0.02 * z[1]).exp(), gaps, Setting())
-
-
-def test_the_curves_are_the_figures() -> None:
-    worn = curve()
-    figure = gap_figure({"worn": worn}, marked=(1.6,))
-    probability, peak, flow = figure.axes
-    assert probability.lines[0].get_ydata().tolist() == worn.p_string_stable.tolist()
-    assert peak.lines[0].get_ydata().tolist() == worn.peak_gain[1].tolist()
-    assert flow.lines[0].get_ydata().tolist() == worn.throughput_vph.tolist()
-    assert worn.least_gap() == 2.5
-    assert "1.6 s: 1818" in [t.get_text() for t in flow.texts]
 
 
 def test_operating_curves_leave_out_what_is_not_found() -> None:
