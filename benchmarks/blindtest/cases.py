@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -37,23 +37,11 @@ _PAIR_EXCESS = (1.25, 8.0)
 _TOP_SPEED_MPS = 44.0
 
 
-def draw_cases(
-    n: int,
-    seed: int,
-    *,
-    mix: Mapping[str, float] | None = None,
-    start: int = 0,
-    tiers: Sequence[str] = tuple(TIERS),
-    effects: Sequence[str] = tuple(EFFECTS),
-    outside: Literal["sealed", "calibration"] = "sealed",
-    seconds: float | None = None,
-    manoeuvre: str | None = None,
-    signals: Sequence[str] = SIGNALS,
-    recorder: Recording = "ideal",
-) -> Iterator[Case]:
+def draw_cases(n: int, seed: int, *, start: int = 0, **settings: Any) -> Iterator[Case]:
     """Cases `start` to `start + n - 1` of the set `seed`, one after another.
 
-    Args: `mix`: shares of the kinds (default 25 % none, 40 % single, 20 % pair, 15 % outside), kept in every 20 cases;
+    `settings`: those of `draw_case`. `mix`: shares of the kinds (default 25 % none, 40 % single, 20 % pair, 15 %
+    outside), kept in every 20 cases;
     `several`: three to five causes of ordinary size (`several.py`), with the oracle's budget of the gap.
     `tiers`, `effects`: single cases cover all their combinations in random order; causes outside the table are drawn
     from all `tiers`. `outside`: which of the two groups of families outside the table. `seconds`, `manoeuvre`: fixed
@@ -71,18 +59,7 @@ def draw_cases(
         ['none', 'none']
     """
     for i in range(start, start + n):
-        yield draw_case(
-            i,
-            seed,
-            mix=mix,
-            tiers=tiers,
-            effects=effects,
-            outside=outside,
-            seconds=seconds,
-            manoeuvre=manoeuvre,
-            signals=signals,
-            recorder=recorder,
-        )
+        yield draw_case(i, seed, **settings)
 
 
 def draw_case(

@@ -6,7 +6,7 @@ import json
 import math
 import sys
 import tempfile
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +57,6 @@ class Row:
     peak_mb: float = math.nan
     density_error: float | None = None
     trials: list[dict[str, Any]] = field(default_factory=list)
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def say(text: str) -> None:
