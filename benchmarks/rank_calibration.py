@@ -159,6 +159,8 @@ def inflated(posterior: Tensor, factor: float) -> Tensor:
 VARIED = (0.1, 2.0)
 """Amplitudes [m/s^2] from weak to strong excitation."""
 
+BATCH = 500
+"""Windows drawn, and vehicles tracked, at once."""
 QUADRATURE_BATCH = 20
 """Windows integrated at once: more would exceed the cache."""
 
@@ -166,50 +168,44 @@ QUADRATURE_BATCH = 20
 def sbc_quadrature(
     replications: int = 2000,
     *,
-    rows: int = 200,
     amplitude: Amplitude = VARIED,
-    prior: Prior | None = None,
     draws: int = 99,
-    nodes: int = 31,
     seed: int = 0,
-    batch: int = 500,
 ) -> RankCalibration:
     """Calibration of a single window's exact posterior, by quadrature, for the parameters only.
 
-    Windows for which ``nodes`` are too few are included in the figures. Ranks are ``below`` in ``draws + 1`` steps.
+    Windows for which 31 nodes are too few are included in the figures. Ranks are ``below`` in ``draws + 1`` steps.
 
     Args:
         replications: truths drawn from the prior, each with a window of its own.
-        rows, amplitude: length [samples of 10 ms] and excitation [m/s^2] of the windows, see :func:`statistics`.
-        prior: of ``z = log(T_L, K_L, sigma)``; the library's first prior by default.
-        batch: windows drawn at once.
+        amplitude: excitation of the windows [m/s^2], see :func:`statistics`.
 
     Raises:
-        InputError: for ``draws`` that 20 bins do not divide, or ``replications`` or ``batch`` not positive.
+        InputError: for ``draws`` that 20 bins do not divide, or ``replications`` not positive.
     """
-    check_sizes(replications, draws, 1.0, batch)
+    check_sizes(replications, draws)
     parts = []
-    for density, truth in drawn_windows(replications, batch, rows, amplitude, prior, seed):
+    for density, truth in drawn_windows(replications, BATCH, amplitude, None, seed):
         few = [density.select(index) for index in torch.arange(density.windows).split(QUADRATURE_BATCH)]
         values = truth.exp().split(QUADRATURE_BATCH)
-        below = torch.cat([integrate(d, nodes=nodes).cdf(v) for d, v in zip(few, values, strict=True)])
+        below = torch.cat([integrate(d, nodes=31).cdf(v) for d, v in zip(few, values, strict=True)])
         ranks = (below * (draws + 1)).long().clamp(0, draws)
         parts.append(RankCalibration(density.names, ranks, draws, below))
     return joined(parts)
 
 
 def drawn_windows(
-    replications: int, batch: int, rows: int, amplitude: Amplitude, prior: Prior | None, seed: int
+    replications: int, batch: int, amplitude: Amplitude, prior: Prior | None, seed: int
 ) -> Iterator[tuple[JerkDensity, Tensor]]:
     """Batches of windows and the truths ``z`` they were drawn from; nothing else draws from their generator."""
     prior = Joint(default_actuation_prior(), default_jerk_noise_prior()) if prior is None else prior
     generator = torch.Generator().manual_seed(seed)
     for count in batches(replications, batch):
         truth = prior.sample(1, count, generator=generator)[0]
-        yield JerkDensity(statistics(truth, rows=rows, amplitude=amplitude, generator=generator), prior), truth
+        yield JerkDensity(statistics(truth, amplitude=amplitude, generator=generator), prior), truth
 
 
-def check_sizes(replications: int, draws: int, inflate: float, batch: int) -> None:
+def check_sizes(replications: int, draws: int = 99, inflate: float = 1.0, batch: int = BATCH) -> None:
     """Raises `InputError` for sizes out of range, by name."""
     if replications < 1 or batch < 1:
         raise InputError(f"replications, batch: found {replications}, {batch}, need 1 or more")
@@ -219,7 +215,7 @@ def check_sizes(replications: int, draws: int, inflate: float, batch: int) -> No
         raise InputError(f"inflate: found {inflate}, need a positive factor")
 
 
-def batches(total: int, size: int) -> list[int]:
+def batches(total: int, size: int = BATCH) -> list[int]:
     """`total` in parts of `size`, and what is left."""
     return [min(size, total - first) for first in range(0, total, size)]
 

@@ -37,8 +37,8 @@ _PAIR_EXCESS = (1.25, 8.0)
 _TOP_SPEED_MPS = 44.0
 
 
-def draw_cases(n: int, seed: int, *, start: int = 0, **settings: Any) -> Iterator[Case]:
-    """Cases `start` to `start + n - 1` of the set `seed`, one after another.
+def draw_cases(n: int, seed: int, **settings: Any) -> Iterator[Case]:
+    """The first `n` cases of the set `seed`, one after another.
 
     `settings`: those of `draw_case`. `mix`: shares of the kinds (default 25 % none, 40 % single, 20 % pair, 15 %
     outside), kept in every 20 cases;
@@ -58,7 +58,7 @@ def draw_cases(n: int, seed: int, *, start: int = 0, **settings: Any) -> Iterato
         >>> [case.truth_name for case in draw_cases(2, seed=1, mix={"none": 1.0}, seconds=10.0)]
         ['none', 'none']
     """
-    for i in range(start, start + n):
+    for i in range(n):
         yield draw_case(i, seed, **settings)
 
 

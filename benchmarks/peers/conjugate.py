@@ -38,9 +38,6 @@ class Conjugate:
         posterior: ``(1, draw, window, 3)`` draws of ``(T_L [s], K_L [-], sigma [m/s^3])``, equally weighted; its
             ``converged`` is false where the effective sample size is below the least asked for.
         ess: effective sample size of the weighted proposals, ``(window,)``. Resampling adds nothing to it.
-        log_evidence: log integral of the density, ``(window,)``.
-        log_evidence_error: its standard error, ``(window,)``.
-        inside: share of the proposals on the positive quadrant, ``(window,)``; the others are rejected.
 
     Example:
         >>> import torch
@@ -53,9 +50,6 @@ class Conjugate:
 
     posterior: Posterior
     ess: Tensor
-    log_evidence: Tensor
-    log_evidence_error: Tensor
-    inside: Tensor
 
 
 def sample_conjugate(
@@ -114,8 +108,7 @@ def sample_conjugate(
     index = _systematic(weight, draws, generator)
     chosen = z.take_along_dim(index.unsqueeze(-1), 0).exp()
     posterior = Posterior(density.names, chosen.unsqueeze(0), ess >= least_ess)
-    evidence = peak + (total / proposals).log()
-    return Conjugate(posterior, ess, evidence, (1 / ess - 1 / proposals).clamp_min(0).sqrt(), inside.double().mean(0))
+    return Conjugate(posterior, ess)
 
 
 def _systematic(weight: Tensor, count: int, generator: torch.Generator | None) -> Tensor:

@@ -61,8 +61,6 @@ class Method:
             effective draws wanted, unless ``fixed``.
         batch: settings for many windows at once, or ``None``; ``batch_windows``: at most so many. Where ``scales`` is
             not ``draws`` the settings found for one window are taken.
-        gets: what was done for its speed, in words.
-        same_density: whether it samples the common density; otherwise the table marks it.
         exact: the truth itself.
         slow: the number of windows is cut, and no trial is made.
     """
@@ -77,8 +75,6 @@ class Method:
     scales: str = "draws"
     batch: Settings | None = None
     batch_windows: int = 1000
-    gets: str = ""
-    same_density: bool = True
     exact: bool = False
     slow: bool = False
 

@@ -13,7 +13,6 @@ _ALL = (
         "own.SGLD",
         fixed=True,
         batch={},
-        gets="`sample` with default settings, its walk compiled where numba is installed; sums, closed-form gradient",
     ),
     Method(
         "avtorch-eager",
@@ -22,7 +21,6 @@ _ALL = (
         candidates=({"chains": 320, "walk": "eager"},),
         scales="chains",
         batch={"chains": 320, "walk": "eager"},
-        gets="chains for 2000 effective draws, every step by `SGLD(torch.optim.Optimizer)`",
     ),
     Method(
         "avtorch-matched",
@@ -31,7 +29,6 @@ _ALL = (
         candidates=({"chains": 320}, {"chains": 1280, "draws": 4, "thinning": 1}),
         scales="chains",
         batch={"chains": 320},
-        gets="the same with as many chains as 2000 effective draws need",
     ),
     Method(
         "blackjax-nuts",
@@ -47,7 +44,6 @@ _ALL = (
             {"adapt": "shared", "burn_in": 20, "chains": 64, "warmup": 300, "draws": 60},
         ),
         batch={"chains": 1, "warmup": 300, "draws": 3200},
-        gets="window adaptation, dense mass; one XLA program over the sums; fastest of several warm-ups and chains",
     ),
     Method(
         "blackjax-nuts-stan",
@@ -57,7 +53,6 @@ _ALL = (
         pip="pip install jax blackjax",
         candidates=({"chains": 1, "warmup": 1000, "draws": 3000},),
         batch={"chains": 1, "warmup": 1000, "draws": 2800},
-        gets="one chain, 1000 steps of window adaptation, dense mass; one XLA program over the sums",
     ),
     Method(
         "blackjax-nuts-low-rank",
@@ -66,7 +61,6 @@ _ALL = (
         needs=_JAX,
         pip="pip install jax blackjax",
         candidates=({"low_rank": True, "chains": 1, "warmup": 300, "draws": 3000},),
-        gets="one chain, the package's low-rank mass matrix; one XLA program over the sums",
     ),
     Method(
         "blackjax-mclmc",
@@ -76,7 +70,6 @@ _ALL = (
         pip="pip install jax blackjax",
         candidates=({"kind": "low-rank", "pilot": 500, "samples": 1000, "warmup": 500, "draws": 5000},),
         slow=True,
-        gets="one chain, not adjusted; its warm-up compiles anew for every window",
     ),
     Method(
         "blackjax-laps",
@@ -87,7 +80,6 @@ _ALL = (
         candidates=({"kind": "laps", "burn_in": 300, "adjusted": 600, "chains": 2048},),
         fixed=True,
         slow=True,
-        gets="one draw of each of 2048 chains; compiles anew for every window",
     ),
     Method(
         "blackjax-nuts-mode",
@@ -101,7 +93,6 @@ _ALL = (
             {"mode": True, "adapt": "shared", "burn_in": 10, "chains": 64, "warmup": 150, "draws": 60},
             {"mode": True, "adapt": "chain", "chains": 4, "warmup": 150, "draws": 700},
         ),
-        gets="as BlackJAX NUTS, from a compiled Laplace approximation, whose covariance is its first mass matrix",
     ),
     Method(
         "blackjax-nuts-whitened",
@@ -115,7 +106,6 @@ _ALL = (
             {"space": "whitened", "burn_in": 10, "chains": 128, "step": 1.2, "draws": 15},
         ),
         batch={"space": "whitened", "burn_in": 10, "chains": 16, "step": 1.2, "draws": 130},
-        gets="avtorch's whitening in place of any adaptation, fixed step; one XLA program",
     ),
     Method(
         "blackjax-sgld",
@@ -136,7 +126,6 @@ _ALL = (
             "thinning": 8,
             "draws": 80,
         },
-        gets="avtorch's mode, whitening and step rule, compiled; the step 0.3 keeps its SD ratio within 5 %",
     ),
     Method(
         "blackjax-sgld-plain",
@@ -156,7 +145,6 @@ _ALL = (
             },
         ),
         fixed=True,
-        gets="started at the mode; one step for all parameters, set from the steepest curvature there; compiled",
     ),
     Method(
         "numpyro-nuts",
@@ -170,7 +158,6 @@ _ALL = (
             {"chains": 1, "warmup": 150, "draws": 3000, "mode": True},
             {"chains": 8, "warmup": 150, "draws": 400, "mode": True},
         ),
-        gets="its model and kernel inside one XLA program over the sums, dense mass; fastest of several settings",
     ),
     Method(
         "nutpie",
@@ -183,7 +170,6 @@ _ALL = (
             {"chains": 1, "warmup": 150, "draws": 2500, "low_rank": True},
             {"chains": 1, "warmup": 300, "draws": 4000, "low_rank": False},
         ),
-        gets="PyMC model over the sums compiled by Numba once; low-rank or diagonal mass, the faster",
     ),
     Method(
         "walnuts",
@@ -192,8 +178,6 @@ _ALL = (
         needs=("walnutpie", "numba"),
         pip="pip install walnutpie numba",
         candidates=tuple({"chains": 1, "warmup": warmup, "draws": 2500} for warmup in (100, 300)),
-        gets="density and gradient over the sums as a compiled callback; diagonal metric, the shorter warm-up that is "
-        "accurate",
     ),
     Method(
         "pyro-nuts",
@@ -204,7 +188,6 @@ _ALL = (
         candidates=({"chains": 1, "warmup": 300, "draws": 2500},),
         fixed=True,
         slow=True,
-        gets="`avtorch.inference.nuts`: dense mass, sums, start from the Laplace approximation",
     ),
     Method(
         "posteriors",
@@ -214,7 +197,6 @@ _ALL = (
         pip="pip install posteriors",
         candidates=({"step": 0.3, "chains": 64, "burn_in": 20, "thinning": 4, "draws": 250},),
         slow=True,
-        gets="avtorch's mode, whitening, step rule and log density; eager torch, as the package is",
     ),
     Method(
         "scalar",
@@ -223,7 +205,6 @@ _ALL = (
         candidates=({"whitened": True, "step": 0.3, "burn_in": 100, "draws": 4000},),
         fixed=True,
         slow=True,
-        gets="one chain, Python loop, autograd over all rows; whitened at its mode",
     ),
     Method(
         "scalar-plain",
@@ -232,7 +213,6 @@ _ALL = (
         candidates=({"whitened": False, "step": 0.3, "burn_in": 100, "draws": 4000},),
         fixed=True,
         slow=True,
-        gets="the same without whitening",
     ),
     Method(
         "conjugate",
@@ -240,7 +220,6 @@ _ALL = (
         "conjugate.Runner",
         candidates=({"draws": 4000, "proposals": 4000},),
         batch={"draws": 4000, "proposals": 4000},
-        gets="exact route for this likelihood only: the limit",
     ),
     Method(
         "laplace",
@@ -248,7 +227,6 @@ _ALL = (
         "own.Laplace",
         fixed=True,
         batch={},
-        gets="mode and curvature in the log parameters, log-normal moments; no draws",
     ),
     Method(
         "ukf",
@@ -257,8 +235,6 @@ _ALL = (
         needs=("filterpy",),
         pip="pip install filterpy",
         fixed=True,
-        same_density=False,
-        gets="state (log T_L, log K_L) from the prior, noise from least squares; no draws, no sigma",
     ),
     Method(
         "rls",
@@ -266,8 +242,6 @@ _ALL = (
         "rls.Runner",
         fixed=True,
         batch={},
-        same_density=False,
-        gets="on (1/T_L, K_L/T_L) without a prior, delta method; no draws, no sigma",
     ),
     Method(
         "quadrature",
@@ -277,7 +251,6 @@ _ALL = (
         batch={},
         batch_windows=100,
         exact=True,
-        gets="the truth of the table",
     ),
 )
 

@@ -63,8 +63,6 @@ def test_cases_are_what_they_say(cases: list[Case]) -> None:
         if case.kind == "none":
             assert case.visibility < 1.001
             assert case.tier is None
-            moving = case.run.true_speed >= 0.3
-            np.testing.assert_allclose(case.with_cause[moving], case.without[moving], atol=1e-6)
         else:
             assert case.tier in TIERS
             low, high = TIERS[case.tier]
