@@ -1,10 +1,9 @@
-"""Budgets and counts in the cells of a table."""
+"""Budgets in the cells of a table."""
 
 from __future__ import annotations
 
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.budget import Budget
-from benchmarks.blindtest.intervals import wilson
 
 
 def interval(q: Quantity) -> str:
@@ -23,11 +22,3 @@ def causes(budget: Budget) -> str:
             cells.append(f"{part.name} {part.share.mean:.0%}: {', '.join(values)}")
     cells += [f"{part.name}, by chance" for part in budget.chance if part.name in budget.names]
     return "; ".join(cells)
-
-
-def counted(hits: int, of: int) -> str:
-    """How many of how many, with Wilson's 90 % interval of the share."""
-    between = wilson(hits, of)
-    return (
-        f"{hits} of {of}" if between is None else f"{hits} of {of} ({100 * between[0]:.0f} to {100 * between[1]:.0f} %)"
-    )

@@ -18,11 +18,8 @@ to it; names that neither the effect nor the untouched recording accounts for; w
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -34,30 +31,12 @@ from benchmarks.budget_cells import causes
 from benchmarks.effects_in_front import in_front
 from benchmarks.known_facts import HEADER as FACTS_HEADER
 from benchmarks.known_facts import Told, closing, told
+from benchmarks.recordings import SETS, folder, joined
 
-SETS: dict[str, tuple[str, ...]] = {
-    "genesis, three laps": ("genesis/lap1.csv", "genesis/lap2.csv", "genesis/lap3.csv"),
-    "genesis, lap 1": ("genesis/lap1.csv",),
-    "genesis, lap 2": ("genesis/lap2.csv",),
-    "genesis, lap 3": ("genesis/lap3.csv",),
-    "indy_av21": ("indy_av21/Putnam_park2023_run4_2.csv",),
-    "roboracer, one mass": ("roboracer/Normal_1weight.csv",),
-    "roboracer, other mass": ("roboracer/single_mass.csv",),
-    "roboracer, tyres": ("roboracer/tire_set_1.csv",),
-    "roboracer, training": ("roboracer/ftg_stanley_total_training.csv",),
-    "roboracer, validation": ("roboracer/ftg_stanley_total_validation.csv",),
-    "dart, 10:02": ("dart/09_16_2024_10_02_28_onboard10Hz.csv",),
-    "dart, 10:27": ("dart/09_16_2024_10_27_02_onboard10Hz.csv",),
-    "dart, 10:02, motion capture": ("dart/09_16_2024_10_02_28_vicon50Hz.csv",),
-    "dart, 10:27, motion capture": ("dart/09_16_2024_10_27_02_vicon50Hz.csv",),
-    "volvo_truck": ("volvo_truck/052311_grade.csv",),
-}
-"""Recordings with commands, by name: the logs of one car."""
 HEADER = (
     "| recording | s | error before, left | causes | unexplained | first half / second half | families | seconds |\n"
     "|---|---|---|---|---|---|---|---|"
 )
-_BETWEEN_S = 5.0
 
 
 def half(logs: Sequence[Log], which: int) -> list[Log]:
@@ -87,30 +66,12 @@ def families_alike(one: Budget | str, other: Budget | str) -> tuple[int, int, in
     return len(both), len(mine.keys() | others.keys()), sum(agree), len(agree)
 
 
-def joined(logs: Sequence[Log]) -> Log:
-    """One log of several, each a segment, with some seconds between them."""
-    if len(logs) == 1:
-        return logs[0]
-    ends = np.cumsum([0.0, *(log.seconds + _BETWEEN_S for log in logs)])
-    columns: dict[str, Any] = {
-        name: np.concatenate([getattr(log, name) for log in logs])
-        for name in ("accel_cmd", "speed", "accel", "engaged")
-        if all(getattr(log, name, None) is not None for log in logs)
-    }
-    time = np.concatenate([log.elapsed - log.elapsed[0] + end for log, end in zip(logs, ends[:-1], strict=True)])
-    segment = np.concatenate([np.full(log.rows, number) for number, log in enumerate(logs)])
-    return Log.from_arrays(name=logs[0].name, time=time, segment=segment, **columns)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="recordings with this in their name")
     parser.add_argument("--in-front", type=float, nargs="+", default=[], metavar="SIZE")
     parser.add_argument("--picture", metavar="FILE")
     arguments = parser.parse_args()
-    folder = os.environ.get("AVTORCH_DATA")
-    if folder is None:
-        raise SystemExit("AVTORCH_DATA: not set, needs the folder of the recordings")
     if not (arguments.picture or arguments.in_front):
         print(HEADER, flush=True)
     facts: list[Told] = []
@@ -118,7 +79,7 @@ def main() -> None:
     for name, files in SETS.items():
         if arguments.only not in name:
             continue
-        logs = [Log.read(Path(folder) / file) for file in files]
+        logs = [Log.read(folder() / file) for file in files]
         if arguments.picture:
             plots.save(plots.diagnosis_figure(diagnose(logs)), arguments.picture)
             return

@@ -32,7 +32,7 @@ from benchmarks.rank_calibration import (
     joined,
     sbc_quadrature,
 )
-from benchmarks.sine_windows import Amplitude, statistics
+from benchmarks.sine_windows import ROWS, Amplitude, statistics
 
 LEVEL, SEED = 0.01, 20240601
 STRONG, WEAK, VARIED = 1.0, 0.1, (0.1, 2.0)
@@ -58,7 +58,6 @@ def sgld(settings: SamplerSettings | None = None) -> Sampler:
 def sbc(
     replications: int = 4000,
     *,
-    rows: int = 200,
     amplitude: Amplitude = VARIED,
     prior: Prior | None = None,
     sampler: Sampler | None = None,
@@ -71,7 +70,7 @@ def sbc(
 
     Args:
         replications: truths drawn from the prior, each with a window of its own.
-        rows, amplitude: length [samples of 10 ms] and excitation [m/s^2] of the windows, see :func:`statistics`.
+        amplitude: excitation of the windows [m/s^2], see :func:`statistics`.
         prior: of ``z = log(T_L, K_L, sigma)``; the library's first prior by default.
         sampler: what is tested; SGLD with default settings by default.
         draws: draws that a rank counts, spread over chains and time to be nearly independent.
@@ -85,7 +84,7 @@ def sbc(
     sampler = sgld() if sampler is None else sampler
     own = torch.Generator().manual_seed(_other(seed))
     parts = []
-    for density, truth in drawn_windows(replications, batch, rows, amplitude, prior, seed):
+    for density, truth in drawn_windows(replications, batch, amplitude, prior, seed):
         posterior, usable = sampler(density, own)
         parts.append(RankCalibration.of(density, truth, posterior, usable, draws=draws, inflate=inflate))
     return joined(parts)
@@ -102,13 +101,9 @@ def sbc_loop(
     windows: int = 5,
     mode: CarriedBy = "posterior",
     truth: Literal["constant", "claimed"] | None = None,
-    rows: int = 200,
     amplitude: Amplitude = VARIED,
     rule: ExcitationRule | None = None,
-    draws: int = 99,
-    inflate: float = 1.0,
     seed: int = 0,
-    batch: int = 500,
     **loop: Any,
 ) -> list[RankCalibration]:
     """Calibration of the sequential loop after each of its windows; replications are its vehicles.
@@ -131,30 +126,25 @@ def sbc_loop(
     Raises:
         InputError: as :func:`sbc`, or for ``truth`` of another name.
     """
-    check_sizes(replications, draws, inflate, batch)
+    check_sizes(replications)
     if truth not in (None, "constant", "claimed"):
         raise InputError(f"truth: found {truth!r}, need 'constant' or 'claimed'")
     constant = mode == "posterior" if truth is None else truth == "constant"
     generator = torch.Generator().manual_seed(seed)
     parts: list[list[RankCalibration]] = [[] for _ in range(windows)]
-    for number, count in enumerate(batches(replications, batch)):
-        kept = 10 * (draws + 1) - 1
-        inference = SequentialInference(vehicles=count, mode=mode, kept=kept, seed=_other(seed, number), **loop)
+    for number, count in enumerate(batches(replications)):
+        inference = SequentialInference(vehicles=count, mode=mode, kept=999, seed=_other(seed, number), **loop)
         z = inference.prior().sample(1, count, generator=generator)[0]
         for window in range(windows):
             prior = inference.prior()
             if not constant:
                 z = prior.sample(1, count, generator=generator)[0]
-            seen = statistics(z, rows=rows, amplitude=amplitude, generator=generator)
-            excited = torch.ones(count, dtype=torch.bool) if rule is None else rule(seen, rows)
+            seen = statistics(z, amplitude=amplitude, generator=generator)
+            excited = torch.ones(count, dtype=torch.bool) if rule is None else rule(seen, ROWS)
             belief = inference.update(lambda index, own, seen=seen: JerkDensity(seen.select(index), own), excited)
             used = excited.nonzero().squeeze(-1)
             density = JerkDensity(seen.select(used), prior.select(used))
-            parts[window].append(
-                RankCalibration.of(
-                    density, z[used], belief.draws[:, used], belief.converged[used], draws=draws, inflate=inflate
-                )
-            )
+            parts[window].append(RankCalibration.of(density, z[used], belief.draws[:, used], belief.converged[used]))
     return [joined(part) for part in parts]
 
 

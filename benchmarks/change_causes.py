@@ -12,10 +12,8 @@ between them or none.
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -23,7 +21,8 @@ from avtorch import Log, compare, diagnose
 from avtorch.errors import InputError
 from avtorch.gap.result.comparison import ChangeCause, Comparison
 from benchmarks.blindtest import MANOEUVRES, Car, DrivePlan, Recorder, draw_car, draw_recorder, put_in_front, simulate
-from benchmarks.blindtest.intervals import wilson
+from benchmarks.blindtest.intervals import counted
+from benchmarks.recordings import folder
 
 TRAINING = "roboracer/ftg_stanley_total_training.csv"
 VALIDATION = "roboracer/ftg_stanley_total_validation.csv"
@@ -98,11 +97,11 @@ def line(name: str, comparison: Comparison) -> str:
     return f"| {name} | {lag} | {gain} | {cell(cause)} | {least} |"
 
 
-def recordings(folder: Path, only: str) -> None:
+def recordings(only: str) -> None:
     for name, pair in PAIRS.items():
         if only in name:
             try:
-                comparison = compare(*([Log.read(folder / file) for file in side] for side in pair))
+                comparison = compare(*([Log.read(folder() / file) for file in side] for side in pair))
             except InputError as refusal:
                 print(f"| {name} | refused: {refusal} |", flush=True)
                 continue
@@ -110,12 +109,12 @@ def recordings(folder: Path, only: str) -> None:
             print(f"    {comparison.why}", flush=True)
 
 
-def in_front(folder: Path, size: float, only: str) -> None:
+def in_front(size: float, only: str) -> None:
     """Prints a line for each known change, and how many were named."""
     for name, pair in ONE_CAR.items():
         if only not in name:
             continue
-        before, after = ([Log.read(folder / file) for file in side] for side in pair)
+        before, after = ([Log.read(folder() / file) for file in side] for side in pair)
         car = diagnose(before, effects=[]).simulator
         assert car is not None
         fitted = {"T_L": float(car.T_L), "K_L": float(car.K_L)}
@@ -175,7 +174,8 @@ def simulated(count: int, *, seed: int, seconds: float, recorder: str, only: str
             print(f"| {index} {manoeuvre} {car.T_L:.2f} {list(lacks)} | {change} | {cell(cause)} |", flush=True)
     for change, rows in answers.items():
         shares = [
-            f"{label} {_share([row[k] for row in rows])}" for k, label in enumerate(("named", "in aliases", "none"))
+            f"{label} {counted(sum(row[k] for row in rows), len(rows))}"
+            for k, label in enumerate(("named", "in aliases", "none"))
         ]
         print(f"{change}: {'; '.join(shares)}")
 
@@ -183,12 +183,6 @@ def simulated(count: int, *, seed: int, seconds: float, recorder: str, only: str
 def _drive(car: Car, plan: DrivePlan, effects: dict[str, dict[str, float]]) -> Log:
     run = simulate(car, plan.pilot(), seconds=plan.seconds, rate_hz=plan.rate_hz, effects=effects, seed=plan.seed)
     return Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed)
-
-
-def _share(hits: Sequence[bool]) -> str:
-    between = wilson(sum(hits), len(hits))
-    assert between is not None
-    return f"{sum(hits)} of {len(hits)} ({100 * between[0]:.0f} to {100 * between[1]:.0f} %)"
 
 
 def main() -> None:
@@ -203,13 +197,10 @@ def main() -> None:
     if given.simulated:
         simulated(given.simulated, seed=given.seed, seconds=given.seconds, recorder=given.recorder, only=given.only)
         return
-    folder = os.environ.get("AVTORCH_DATA")
-    if folder is None:
-        raise SystemExit("AVTORCH_DATA: not set, needs the folder of the recordings")
     for size in given.in_front:
-        in_front(Path(folder), size, given.only)
+        in_front(size, given.only)
     if not given.in_front:
-        recordings(Path(folder), given.only)
+        recordings(given.only)
 
 
 if __name__ == "__main__":

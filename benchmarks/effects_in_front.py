@@ -37,8 +37,9 @@ from avtorch.gap.result.budget import Budget, Part
 from avtorch.gap.sensor_noise import with_sensor_noise
 from avtorch.io import Log
 from benchmarks.blindtest import IN_FRONT, put_in_front
+from benchmarks.blindtest.intervals import counted
 from benchmarks.blindtest.parameter_score import SIZE_OF, SIZE_WITHIN
-from benchmarks.budget_cells import causes, counted
+from benchmarks.budget_cells import causes
 
 _COLUMNS = (
     "effect",

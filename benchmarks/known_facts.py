@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 from avtorch.gap.quantity import Quantity, unit_of
 from avtorch.gap.result.budget import Budget
-from benchmarks.budget_cells import counted, interval
+from benchmarks.blindtest.intervals import counted
+from benchmarks.budget_cells import interval
 
 LAG_WITH_DELAY = "T_L with delay_s"
 
@@ -60,7 +61,7 @@ FACTS: Mapping[str, Sequence[Fact]] = {
     "dart, 10:27, motion capture": _DART,
     "volvo_truck": (Fact("driven on a grade", "road_grade", "grade_rms", None),),
 }
-"""By the name of a recording in `benchmarks.budgets.SETS`."""
+"""By the name of a recording in `benchmarks.recordings.SETS`."""
 
 HEADER = "| recording | fact | known | budget | its 90 % interval |\n|---|---|---|---|---|"
 

@@ -12,7 +12,6 @@ through a filter of 50 ms, is held for 100 ms and rounded to 0.02 m/s.
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -29,32 +28,26 @@ from avtorch.errors import InputError
 from avtorch.io import Log
 from avtorch.pedals import PedalMap, fit_pedals
 from avtorch.pedals.pedal_map import inputs_of
+from benchmarks.recordings import SETS, folder
 from benchmarks.repair import FREE_S, SLOWEST_HZ, WARM_S, pieces
 from tests.pedals import cars
 
 _AV21 = {"map": ["throttle=throttle_pct", "brake=brake_kPa"], "unit": ["throttle=%", "brake=kPa"]}
 _ROBORACER = {"map": ["current=current_A"]}
 RECORDINGS: dict[str, tuple[str, dict[str, Any]]] = {
-    "AV-21": ("indy_av21/Putnam_park2023_run4_2.csv", _AV21),
-    "roboracer, one mass": ("roboracer/Normal_1weight.csv", _ROBORACER),
-    "roboracer, other mass": ("roboracer/single_mass.csv", _ROBORACER),
-    "roboracer, tyres": ("roboracer/tire_set_1.csv", _ROBORACER),
-    "roboracer, training": ("roboracer/ftg_stanley_total_training.csv", _ROBORACER),
-    "roboracer, validation": ("roboracer/ftg_stanley_total_validation.csv", _ROBORACER),
-    "dart, 10:02": ("dart/09_16_2024_10_02_28_onboard10Hz.csv", {}),
-    "dart, 10:27": ("dart/09_16_2024_10_27_02_onboard10Hz.csv", {}),
-    "dart, 10:02, motion capture": ("dart/09_16_2024_10_02_28_vicon50Hz.csv", {}),
-    "dart, 10:27, motion capture": ("dart/09_16_2024_10_27_02_vicon50Hz.csv", {}),
-    "volvo_truck": ("volvo_truck/052311_grade.csv", {"map": ["torque=engine_torque_cmd_Nm"]}),
-    "volvo_truck, its reference speed": ("volvo_truck/052311_grade.csv", {"map": ["speed_cmd=ref_v"]}),
+    "AV-21": (SETS["indy_av21"][0], _AV21),
+    **{name: (SETS[name][0], _ROBORACER) for name in SETS if name.startswith("roboracer")},
+    **{name: (SETS[name][0], {}) for name in SETS if name.startswith("dart")},
+    "volvo_truck": (SETS["volvo_truck"][0], {"map": ["torque=engine_torque_cmd_Nm"]}),
+    "volvo_truck, its reference speed": (SETS["volvo_truck"][0], {"map": ["speed_cmd=ref_v"]}),
 }
 """Recordings by name: the file, and how its pedals are read."""
 
 
-def read(name: str, folder: Path) -> Log:
+def read(name: str, root: Path) -> Log:
     """A recording, without its nominal command."""
     file, options = RECORDINGS[name]
-    return replace(Log.read(folder / file, **options), accel_cmd=None)
+    return replace(Log.read(root / file, **options), accel_cmd=None)
 
 
 def known(car: cars.Demand, seed: int, *, ordinary: bool) -> Log:
@@ -131,8 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--only", default="")
     given = parser.parse_args(arguments)
-    folder = Path(os.environ["AVTORCH_DATA"])
-    logs: dict[str, Callable[[], Log]] = {name: partial(read, name, folder) for name in RECORDINGS}
+    logs: dict[str, Callable[[], Log]] = {name: partial(read, name, folder()) for name in RECORDINGS}
     for car, seed, ordinary in product((cars.plain, cars.with_dead_zone), (101, 102), (False, True)):
         recorder = "ordinary" if ordinary else "ideal"
         logs[f"known car, {car.__name__}, {recorder} recorder, {seed}"] = partial(known, car, seed, ordinary=ordinary)

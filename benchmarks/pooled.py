@@ -136,31 +136,24 @@ class PooledComparison:
     Attributes:
         shift: difference of means in the pooled posterior's SDs.
         sd_ratio: SD of the loop over that of the pooled posterior.
-        covered, pooled_covered: whether the loop's and the pooled 90 % interval hold the truth.
+        covered: whether the loop's 90 % interval holds the truth.
     """
 
     names: tuple[str, ...]
     shift: Tensor
     sd_ratio: Tensor
     covered: Tensor
-    pooled_covered: Tensor
 
     @classmethod
     def of(cls, track: Track, pooled: Quadrature) -> PooledComparison:
         """Of the parameters that both have."""
         d = len(pooled.names)
-        below = pooled.cdf(track.truth[-1, :, :d])
         return cls(
             pooled.names,
             (track.mean[-1, :, :d] - pooled.mean) / pooled.sd,
             track.sd[-1, :, :d] / pooled.sd,
             track.covered[-1, :, :d],
-            (below - 0.5).abs() <= 0.45,
         )
-
-    def select(self, index: Tensor) -> PooledComparison:
-        """The vehicles named by ``index``."""
-        return PooledComparison(self.names, *(getattr(self, f.name)[index] for f in fields(self)[1:]))
 
 
 def constant(z: Tensor, windows: int) -> Tensor:

@@ -9,23 +9,32 @@ Ranks stay uniform under any selection that depends on data alone (excited windo
 
 The package ``simuk`` does SBC for PyMC, Bambi and NumPyro models, one fit after another in a Python loop. Our densities
 are not such models, and all replications are windows of one tensor; so the ranks are computed here, in a few lines.
+
+Are the ranks uniform? Three tests of one hypothesis, and the simultaneous band of the ECDF, all without simulation.
+Ranks ``0..draws`` of ``replications`` truths; under the hypothesis each is uniform on the ``draws + 1`` values and they
+are independent. The ECDF band is that of Sailynoja, Burkner and Vehtari (2022): pointwise binomial intervals, widened
+until all of them hold at once with the probability asked for. That probability is found exactly, by the recursion over
+counts for a Poisson process in a corridor (Moscovich and Nadler 2017), so p-values far below 1 % are accurate.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
+import numpy as np
 import torch
+from scipy.stats import binom, chi2, norm, poisson
 from torch import Tensor
 
+from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.inference.jerk import JerkDensity
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
 from avtorch.inference.quadrature import integrate
 from benchmarks.sine_windows import Amplitude, statistics
-from benchmarks.uniformity import bonferroni, chi2_p_value, dispersion_p_value, ecdf_band, ecdf_p_value
 
 LEVELS = (0.5, 0.9, 0.95)
 """Interval levels whose coverage is computed."""
@@ -150,6 +159,8 @@ def inflated(posterior: Tensor, factor: float) -> Tensor:
 VARIED = (0.1, 2.0)
 """Amplitudes [m/s^2] from weak to strong excitation."""
 
+BATCH = 500
+"""Windows drawn, and vehicles tracked, at once."""
 QUADRATURE_BATCH = 20
 """Windows integrated at once: more would exceed the cache."""
 
@@ -157,50 +168,44 @@ QUADRATURE_BATCH = 20
 def sbc_quadrature(
     replications: int = 2000,
     *,
-    rows: int = 200,
     amplitude: Amplitude = VARIED,
-    prior: Prior | None = None,
     draws: int = 99,
-    nodes: int = 31,
     seed: int = 0,
-    batch: int = 500,
 ) -> RankCalibration:
     """Calibration of a single window's exact posterior, by quadrature, for the parameters only.
 
-    Windows for which ``nodes`` are too few are included in the figures. Ranks are ``below`` in ``draws + 1`` steps.
+    Windows for which 31 nodes are too few are included in the figures. Ranks are ``below`` in ``draws + 1`` steps.
 
     Args:
         replications: truths drawn from the prior, each with a window of its own.
-        rows, amplitude: length [samples of 10 ms] and excitation [m/s^2] of the windows, see :func:`statistics`.
-        prior: of ``z = log(T_L, K_L, sigma)``; the library's first prior by default.
-        batch: windows drawn at once.
+        amplitude: excitation of the windows [m/s^2], see :func:`statistics`.
 
     Raises:
-        InputError: for ``draws`` that 20 bins do not divide, or ``replications`` or ``batch`` not positive.
+        InputError: for ``draws`` that 20 bins do not divide, or ``replications`` not positive.
     """
-    check_sizes(replications, draws, 1.0, batch)
+    check_sizes(replications, draws)
     parts = []
-    for density, truth in drawn_windows(replications, batch, rows, amplitude, prior, seed):
+    for density, truth in drawn_windows(replications, BATCH, amplitude, None, seed):
         few = [density.select(index) for index in torch.arange(density.windows).split(QUADRATURE_BATCH)]
         values = truth.exp().split(QUADRATURE_BATCH)
-        below = torch.cat([integrate(d, nodes=nodes).cdf(v) for d, v in zip(few, values, strict=True)])
+        below = torch.cat([integrate(d, nodes=31).cdf(v) for d, v in zip(few, values, strict=True)])
         ranks = (below * (draws + 1)).long().clamp(0, draws)
         parts.append(RankCalibration(density.names, ranks, draws, below))
     return joined(parts)
 
 
 def drawn_windows(
-    replications: int, batch: int, rows: int, amplitude: Amplitude, prior: Prior | None, seed: int
+    replications: int, batch: int, amplitude: Amplitude, prior: Prior | None, seed: int
 ) -> Iterator[tuple[JerkDensity, Tensor]]:
     """Batches of windows and the truths ``z`` they were drawn from; nothing else draws from their generator."""
     prior = Joint(default_actuation_prior(), default_jerk_noise_prior()) if prior is None else prior
     generator = torch.Generator().manual_seed(seed)
     for count in batches(replications, batch):
         truth = prior.sample(1, count, generator=generator)[0]
-        yield JerkDensity(statistics(truth, rows=rows, amplitude=amplitude, generator=generator), prior), truth
+        yield JerkDensity(statistics(truth, amplitude=amplitude, generator=generator), prior), truth
 
 
-def check_sizes(replications: int, draws: int, inflate: float, batch: int) -> None:
+def check_sizes(replications: int, draws: int = 99, inflate: float = 1.0, batch: int = BATCH) -> None:
     """Raises `InputError` for sizes out of range, by name."""
     if replications < 1 or batch < 1:
         raise InputError(f"replications, batch: found {replications}, {batch}, need 1 or more")
@@ -210,7 +215,7 @@ def check_sizes(replications: int, draws: int, inflate: float, batch: int) -> No
         raise InputError(f"inflate: found {inflate}, need a positive factor")
 
 
-def batches(total: int, size: int) -> list[int]:
+def batches(total: int, size: int = BATCH) -> list[int]:
     """`total` in parts of `size`, and what is left."""
     return [min(size, total - first) for first in range(0, total, size)]
 
@@ -220,3 +225,126 @@ def joined(parts: list[RankCalibration]) -> RankCalibration:
     first = parts[0]
     ranks, below = (torch.cat([getattr(p, key) for p in parts]) for key in ("ranks", "below"))
     return RankCalibration(first.names, ranks, first.draws, below, sum(p.dropped for p in parts))
+
+
+# Are ranks uniform? Three tests of one hypothesis, and the simultaneous band of the ECDF, all without simulation.
+LEAST = 1e-15
+"""Floor of pointwise probabilities: the corridor's own is accurate to only some 1e-12."""
+
+
+def _counts(ranks: Tensor, draws: int) -> IntArray:
+    """How often each rank occurs, ``(quantity, draws + 1)``."""
+    if ranks.ndim != 2 or not len(ranks):
+        raise InputError(f"ranks: found shape {tuple(ranks.shape)}, need (replication, quantity)")
+    if int(ranks.min()) < 0 or int(ranks.max()) > draws:
+        raise InputError(f"ranks: found {int(ranks.min())} to {int(ranks.max())}, need 0 to {draws}")
+    return np.stack([np.bincount(column, minlength=draws + 1) for column in ranks.numpy().T])
+
+
+def chi2_p_value(ranks: Tensor, draws: int, *, bins: int = 20) -> Tensor:
+    """Pearson's chi^2 on ``bins`` equal bins of the ranks; p-values ``(quantity,)``.
+
+    Raises:
+        InputError: if ``draws + 1`` is no multiple of ``bins`` (bins would not be equally likely), or for ranks out of
+            range.
+    """
+    if bins < 2 or (draws + 1) % bins:
+        raise InputError(f"bins: found {bins}, need a divisor of draws + 1 = {draws + 1} of 2 or more")
+    counts = _counts(ranks, draws)
+    binned = counts.reshape(len(counts), bins, -1).sum(-1)
+    expected = len(ranks) / bins
+    return torch.from_numpy(chi2.sf(((binned - expected) ** 2 / expected).sum(-1), bins - 1))
+
+
+def dispersion_p_value(ranks: Tensor, draws: int) -> Tensor:
+    """Is the spread right? Mean squared normal score of the ranks against its law; two-sided p-values ``(quantity,)``.
+
+    The sharpest of the three against a posterior that is too wide or too narrow: an SD wrong by a share ``d`` shifts it
+    by about ``2 d``, with an error of ``sqrt(2 / replications)``. It is blind to a shift.
+    """
+    counts = _counts(ranks, draws)
+    score = norm.ppf((np.arange(draws + 1) + 0.5) / (draws + 1)) ** 2
+    found = counts @ score / len(ranks)
+    return torch.from_numpy(2 * norm.sf(np.abs(found - score.mean()) / (score.std() / np.sqrt(len(ranks)))))
+
+
+def ecdf_p_value(ranks: Tensor, draws: int) -> Tensor:
+    """Probability that a uniform ECDF strays as far, by its least likely point; p-values ``(quantity,)``."""
+    n, cdf = len(ranks), _cdf(draws)
+    below = _counts(ranks, draws).cumsum(-1)[:, :-1]
+    tails = np.minimum(binom.cdf(below, n, cdf), binom.sf(below - 1, n, cdf))
+    outside = [1 - _within(*_open_corridor(n, draws, 2 * tail), n, draws) for tail in tails.min(-1)]
+    return torch.tensor(outside, dtype=torch.float64).clamp(0, 1)
+
+
+def ecdf_band(replications: int, draws: int, *, level: float = 0.95) -> tuple[Tensor, Tensor]:
+    """Simultaneous band of the ECDF of uniform ranks: lower and upper at the ranks ``0..draws``, each ``(draws + 1,)``.
+
+    A calibrated posterior's ECDF, ``mean(ranks <= r)``, lies in it for all ``r`` with probability ``level`` or a little
+    more (counts are discrete).
+
+    Raises:
+        InputError: for ``level`` outside (0, 1), or no replications or draws.
+    """
+    if not 0 < level < 1:
+        raise InputError(f"level: found {level}, need a number in (0, 1)")
+    if replications < 1 or draws < 1:
+        raise InputError(f"replications, draws: found {replications}, {draws}, need 1 or more")
+    low, high = _band_counts(replications, draws, level)
+    one = np.ones(1)
+    return tuple(torch.from_numpy(np.concatenate([side / replications, one])) for side in (low, high))  # type: ignore[return-value]
+
+
+def bonferroni(p_values: Tensor) -> float:
+    """One p-value for many, valid under any dependence: the least times their number."""
+    return float((p_values.min() * p_values.numel()).clamp_max(1.0))
+
+
+def _cdf(draws: int) -> FloatArray:
+    """CDF of a uniform rank at ``0..draws - 1``; at ``draws`` it is one whatever the posterior."""
+    return np.arange(1, draws + 1) / (draws + 1)
+
+
+@lru_cache(maxsize=64)
+def _band_counts(n: int, draws: int, level: float) -> tuple[IntArray, IntArray]:
+    # pointwise level: no higher than the simultaneous, no lower than Bonferroni's
+    low, high = np.log((1 - level) / draws) - 1e-3, np.log1p(-level)
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        inside = _within(*_open_corridor(n, draws, np.exp(middle)), n, draws)
+        low, high = (middle, high) if inside >= level else (low, middle)
+    return _open_corridor(n, draws, np.exp(low))
+
+
+def _open_corridor(n: int, draws: int, pointwise: float) -> tuple[IntArray, IntArray]:
+    """Least and greatest count at each rank whose two-sided pointwise p-value is above ``pointwise``."""
+    cdf, pointwise = _cdf(draws), max(pointwise, LEAST)
+    # ppf returns the least count with cdf >= q; shifted slightly because equality, which is outside, needs the next
+    # count
+    low = binom.ppf(0.5 * pointwise, n, cdf).astype(np.int64)
+    low += binom.cdf(low, n, cdf) <= 0.5 * pointwise * (1 + 1e-9)
+    high = binom.isf(0.5 * pointwise, n, cdf).astype(np.int64)
+    high -= binom.sf(high - 1, n, cdf) <= 0.5 * pointwise * (1 + 1e-9)
+    return np.clip(low, 0, n), np.clip(high, 0, n)
+
+
+def _within(low: IntArray, high: IntArray, n: int, draws: int) -> float:
+    """Probability that the cumulated counts of ``n`` uniform ranks stay in ``low..high`` at every rank.
+
+    Counts of a multinomial are independent Poisson counts given their sum: walk through the ranks with Poisson
+    increments, drop what leaves the corridor, and divide by the probability of the sum.
+    """
+    if bool((low > high).any()):
+        return 0.0
+    rate = n / (draws + 1)
+    increment = poisson.pmf(np.arange(int(rate + 40 * np.sqrt(rate) + 40)), rate)
+    state, first = np.ones(1), 0
+    for least, greatest in zip(low, high, strict=True):
+        state = np.convolve(state, increment)
+        last = min(first + len(state) - 1, int(greatest))
+        start = max(first, int(least))
+        if start > last:
+            return 0.0
+        state, first = state[start - first : last - first + 1], start
+    rest = n - first - np.arange(len(state))
+    return float((state * poisson.pmf(rest, rate)).sum() / poisson.pmf(n, n))

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -28,19 +27,16 @@ from avtorch.errors import InputError
 from avtorch.io import Log
 from avtorch.io.log import STANDSTILL_MPS
 from benchmarks.black_boxes import BLACK_BOXES, Driven, PlantDriven, Stretch, free_run
+from benchmarks.recordings import SETS, folder
 
 CHUNK_S, WARM_S, FREE_S = 20.0, 3.0, 10.0
 _UNITS = ["speed=m/s", "accel_cmd=m/s2"]  # said, as a nominal command may be far from what the car does
-RECORDINGS: dict[str, tuple[str, ...]] = {
-    "genesis": ("genesis/lap1.csv", "genesis/lap2.csv", "genesis/lap3.csv"),
-    "AV-21": ("indy_av21/Putnam_park2023_run4_2.csv",),
-    "roboracer, one mass": ("roboracer/Normal_1weight.csv",),
-    "roboracer, training": ("roboracer/ftg_stanley_total_training.csv",),
-    "roboracer, validation": ("roboracer/ftg_stanley_total_validation.csv",),
-    "roboracer, tyres": ("roboracer/tire_set_1.csv",),
-    "dart, 10:02": ("dart/09_16_2024_10_02_28_onboard10Hz.csv",),
-    "dart, 10:27": ("dart/09_16_2024_10_27_02_onboard10Hz.csv",),
-    "volvo_truck": ("volvo_truck/052311_grade.csv",),
+RECORDINGS = {
+    {"genesis, three laps": "genesis", "indy_av21": "AV-21"}.get(name, name): SETS[name]
+    for name in (
+        *("genesis, three laps", "indy_av21", "roboracer, one mass", "roboracer, training", "roboracer, validation"),
+        *("roboracer, tyres", "dart, 10:02", "dart, 10:27", "volvo_truck"),
+    )
 }
 """Recordings with a command in m/s² and 38 s or more, by name: their files."""
 SLOWEST_HZ = 20.0
@@ -167,7 +163,6 @@ def main() -> None:
     parser.add_argument("--only", default="")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
-    folder = Path(os.environ["AVTORCH_DATA"])
     names = ("baseline", "ours", *BLACK_BOXES)
     print(
         f"| recording | taught [s] | {' | '.join(names)} | ours / best | ours / baseline | rest | gained | s | names |"
@@ -178,7 +173,7 @@ def main() -> None:
         if given.only not in name:
             continue
         try:
-            done.append(examined(name, [Log.read(folder / file, unit=_UNITS) for file in files]))
+            done.append(examined(name, [Log.read(folder() / file, unit=_UNITS) for file in files]))
         except InputError as error:
             print(f"| {name} | {error} |", flush=True)
             continue

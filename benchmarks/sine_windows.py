@@ -9,6 +9,8 @@ from avtorch.errors import InputError
 from avtorch.inference import JerkStatistics
 from avtorch.validation.windows import simulate_windows
 
+ROWS = 200
+"""Of a window, 10 ms each."""
 Amplitude = float | tuple[float, float]
 """Of a command's first sine [m/s^2]: a number, or a range from which each window's is drawn evenly in the logarithm."""
 
@@ -37,7 +39,7 @@ def sine_commands(
 def statistics(
     z: Tensor,
     *,
-    rows: int = 200,
+    rows: int = ROWS,
     amplitude: Amplitude = 1.0,
     dt: float = 0.01,
     generator: torch.Generator | None = None,

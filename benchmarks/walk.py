@@ -16,8 +16,8 @@ import torch
 
 from avtorch.inference import SamplerSettings, find_mode, sample
 from avtorch.inference.sampler import walk
+from benchmarks.peers.own import density_of
 from benchmarks.peers.problem import make_windows
-from benchmarks.peers.torch_rows import density_of
 
 #: Windows and chains: one log's, the peers' table, a fleet's.
 SIZES = ((1, 320), (1, 1024), (300, 320), (1000, 128))

@@ -65,23 +65,3 @@ def test_no_other_file_names_an_effect() -> None:
 def test_an_exception_is_still_needed(place: str) -> None:
     at = PACKAGE / place
     assert any(names_in(path) for path in ([at] if at.is_file() else at.glob("*.py")))
-
-
-@pytest.mark.parametrize(
-    ("line", "found"),
-    [
-        ('x = "gust"', True),
-        ('x = f"gust.{name}"', True),
-        ('x = values["dead_time.delay_s"]', True),
-        ("from avtorch.gap import Gust", True),
-        ("from avtorch.gap.effects.gust import _DAMPED", True),
-        ("import avtorch.gap.effects.gust", True),
-        ('"gust"', False),
-        ('x = "gusts blow"', False),
-        ("from avtorch.gap import Effect", False),
-    ],
-)
-def test_what_counts_as_naming_one(line: str, found: bool, tmp_path: Path) -> None:
-    path = tmp_path / "some.py"
-    path.write_text(f'"""Of a gust."""\n\n\ndef some():\n    """gust"""\n\n\n{line}\n', encoding="utf-8")
-    assert bool(names_in(path)) == found

@@ -50,24 +50,24 @@ def test_import_is_light() -> None:
 
 
 @pytest.mark.slow
-def test_estimate_imports_no_more_than_it_needs(tmp_path: Path) -> None:
-    """Half of the command's time was imports that no estimate uses."""
+@pytest.mark.parametrize(
+    ("tokens", "heavy"),
+    [
+        # half of the command's time was imports that no estimate uses
+        (["estimate", "drive.csv", "--estimator", "map"], "scipy sympy pandas pyarrow pyro arviz gap validation paper"),
+        # torch and Matplotlib are nine tenths of the command's processor time; nothing else may add to it
+        (["stability"], "inference gap decision pandas pyarrow scipy sympy"),
+    ],
+    ids=["estimate", "stability"],
+)
+def test_a_command_imports_no_more_than_it_needs(
+    tokens: list[str], heavy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     log = avtorch.simulate(avtorch.Leader.default(start=50.0, duration=6.0, dt=0.05)).log()
     log.write(tmp_path / "drive.csv")
-    tokens = ["estimate", str(tmp_path / "drive.csv"), "--out", str(tmp_path / "out"), "--estimator", "map", "--quiet"]
-    heavy = (
-        *("scipy", "sympy", "pandas", "pyarrow", "pyro", "arviz"),
-        *("avtorch.gap", "avtorch.validation", "avtorch.paper"),
-    )
-    assert loaded(f"from avtorch.cli.app import main; assert main({tokens!r}) == 0", heavy) == []
-
-
-@pytest.mark.slow
-def test_stability_imports_no_estimator(tmp_path: Path) -> None:
-    """torch and Matplotlib are nine tenths of the command's processor time; nothing else may add to it."""
-    heavy = ("avtorch.inference", "avtorch.gap", "avtorch.decision", "pandas", "pyarrow", "scipy", "sympy")
-    tokens = ["stability", "--out", str(tmp_path / "out"), "--quiet"]
-    assert loaded(f"from avtorch.cli.app import main; assert main({tokens!r}) == 0", heavy) == []
+    code = f"from avtorch.cli.app import main; assert main({[*tokens, '--out', 'out', '--quiet']!r}) == 0"
+    assert loaded(code, [name for word in heavy.split() for name in (word, f"avtorch.{word}")]) == []
 
 
 @pytest.mark.slow

@@ -33,24 +33,15 @@ def test_one_name_is_one_length_within_a_call() -> None:
     assert total(torch.ones(2, 3), torch.ones(3)).tolist() == [3.0, 3.0]
     with pytest.raises(ShapeError, match=r"_total, weight: found \(torch.Size\(\[1\]\)"):
         total(torch.ones(2, 3), torch.ones(1))
+    with pytest.raises(ShapeError, match="weight"):  # integers are no floats
+        total(torch.ones(2, 3), torch.ones(3, dtype=torch.int64))
 
 
-def test_integers_are_no_floats() -> None:
-    with pytest.raises(ShapeError, match="weight"):
-        checked(_total)(torch.ones(2, 3), torch.ones(3, dtype=torch.int64))
-
-
-def test_what_is_returned_is_checked_against_what_was_given() -> None:
-    checked(_turned)(torch.ones(2, 2))
-    with pytest.raises(ShapeError, match="return"):
-        checked(_turned)(torch.ones(2, 3))
-
-
-def test_what_has_passed_once_is_not_what_else_may_pass() -> None:
+def test_what_is_returned_is_checked_and_what_has_passed_once_is_not_what_else_may_pass() -> None:
     turned = checked(_turned)
     turned(torch.ones(2, 2))
     turned(torch.ones(2, 2))
-    with pytest.raises(ShapeError):
+    with pytest.raises(ShapeError, match="return"):
         turned(torch.ones(3, 2))
 
 

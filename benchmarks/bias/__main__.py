@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.bias.arms import LONG, Arm, every_arm, length, predict, run
-from benchmarks.bias.equal_compute import equal_compute
+from benchmarks.bias.equal_compute import Printer, equal_compute
 from benchmarks.bias.law import point_covariance
 from benchmarks.bias.measure import Measured, furthest, measure
 from benchmarks.bias.windows import Problem, problem
@@ -79,26 +79,6 @@ def check(problem: Problem, found: Measured, predicted: Tensor) -> Tensor:
     strong = (problem.strength == 2) & ~found.lost
     expected = predicted.gather(-1, found.parameter[:, None]).squeeze(-1)
     return torch.stack([(found.sd_ratio / expected - 1).abs(), found.sd_error / found.sd_ratio])[:, strong]
-
-
-class Printer:
-    """Lines of a table in plain text or Markdown."""
-
-    def __init__(self, *, markdown: bool) -> None:
-        self.markdown = markdown
-
-    def section(self, title: str, heads: tuple[str, ...], widths: tuple[int, ...]) -> None:
-        self.widths = widths
-        print(f"\n### {title}\n" if self.markdown else f"\n{title}")
-        self.row(heads)
-        if self.markdown:
-            print("|" + "---|" * len(heads))
-
-    def row(self, cells: tuple[str, ...]) -> None:
-        if self.markdown:
-            print("| " + " | ".join(cells) + " |", flush=True)
-        else:
-            print(" ".join(f"{cell:>{width}}" for cell, width in zip(cells, self.widths, strict=True)), flush=True)
 
 
 def main() -> None:

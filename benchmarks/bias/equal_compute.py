@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 from unittest import mock
 
 import torch
@@ -24,10 +24,24 @@ CHAINS = 64
 BATCH = 20
 
 
-class _Printer(Protocol):
-    def section(self, title: str, heads: tuple[str, ...], widths: tuple[int, ...]) -> None: ...
+class Printer:
+    """Lines of a table in plain text or Markdown."""
 
-    def row(self, cells: tuple[str, ...]) -> None: ...
+    def __init__(self, *, markdown: bool) -> None:
+        self.markdown = markdown
+
+    def section(self, title: str, heads: tuple[str, ...], widths: tuple[int, ...]) -> None:
+        self.widths = widths
+        print(f"\n### {title}\n" if self.markdown else f"\n{title}")
+        self.row(heads)
+        if self.markdown:
+            print("|" + "---|" * len(heads))
+
+    def row(self, cells: tuple[str, ...]) -> None:
+        if self.markdown:
+            print("| " + " | ".join(cells) + " |", flush=True)
+        else:
+            print(" ".join(f"{cell:>{width}}" for cell, width in zip(cells, self.widths, strict=True)), flush=True)
 
 
 @contextmanager
@@ -100,7 +114,7 @@ def by_langevin(problem: Problem, arm: Arm, gradients: int, method: str) -> Resu
     return Result(method, z[:, :, 0], round(steps * chains * share), seconds, shared=arm.batch is not None)
 
 
-def equal_compute(problem: Problem, printer: _Printer, *, quick: bool) -> None:
+def equal_compute(problem: Problem, printer: Printer, *, quick: bool) -> None:
     """Print the section: the vehicle (0.3 s, 1.0), or else the first one, at each strength."""
     printer.section("equal compute: NUTS and Langevin, 200 points", HEADS, WIDTHS)
     warmup, draws = (100, 100) if quick else (200, 800)

@@ -11,18 +11,17 @@ from typing import Any, Literal
 
 import numpy as np
 
-from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.io import Log, write_json
 from benchmarks.blindtest.car import Car
-from benchmarks.blindtest.catalogue import EFFECTS, family
+from benchmarks.blindtest.catalogue import EFFECTS
 from benchmarks.blindtest.command import Parameters
 from benchmarks.blindtest.drives import DrivePlan
 from benchmarks.blindtest.oracle_budget import oracle_budget
 from benchmarks.blindtest.recorder import Recorder
 from benchmarks.blindtest.replay import Replay
 from benchmarks.blindtest.vehicle import Run
-from benchmarks.blindtest.visibility import Oracle, Sight, exact_gain
+from benchmarks.blindtest.visibility import Oracle, Sight
 
 _MOVING_MPS = 0.3  # slower rows are masked
 
@@ -36,8 +35,7 @@ class Case:
     `kind` and `names` (alphabetical; empty for `none`) are the truth; `parameters` by name; `onset_s`: when the cause
     begins to act (None: from the start; for `gain_change` alone, the time of the change). `visibility`, `tier`: see
     `benchmarks.blindtest.visibility`; `visibility_each`: visibility of each effect of a pair, alone on the same drive.
-    `oracles`: rollout errors, by metric, of GLVD and of a model that knows the cause. `without`, `with_cause` (row,)
-    [m/s²]: noise-free measured acceleration under the logged command, without the cause and with its predictable part.
+    `oracles`: rollout errors, by metric, of GLVD and of a model that knows the cause.
     `recorder`: what the log is written by; visibility, tier and oracles are those of the drive before it. `replay`: of
     a case of several causes, the drive again with only some of them; `signals`: the channels that its budget is of.
 
@@ -83,17 +81,6 @@ class Case:
         """What each of several causes contributes to the gap (`benchmarks.blindtest.oracle_budget`); None for other
         kinds."""
         return None if self.replay is None else oracle_budget(self.replay, self.log(signals=self.signals)).to_dict()
-
-    @property
-    def without(self) -> FloatArray:
-        dt = 1 / self.drive.rate_hz
-        return self.car.K_L * exact_gain(self.run.command, dt, self.car.T_L)[0]
-
-    @property
-    def with_cause(self) -> FloatArray:
-        if self.names and all(family(name).by_chance for name in self.names):
-            return self.without
-        return self.run.accel - self.run.noise_accel - self.run.chance_accel
 
     @property
     def parts(self) -> list[dict[str, Any]]:

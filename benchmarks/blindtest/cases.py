@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -23,8 +23,7 @@ from benchmarks.blindtest.drives import draw_drive, with_stops
 from benchmarks.blindtest.oracle_budget import gap_over_floor
 from benchmarks.blindtest.recorder import draw_recorder
 from benchmarks.blindtest.replay import Replay
-from benchmarks.blindtest.several import LEAST_GAP, draw_several, ordinary
-from benchmarks.blindtest.strength import excess_range, solve_strength
+from benchmarks.blindtest.several import LEAST_GAP, draw_several, excess_range, ordinary, solve_strength
 from benchmarks.blindtest.vehicle import Pilot, Run, simulate
 from benchmarks.blindtest.visibility import TIERS, Sight, oracles, sight, tier_of
 
@@ -38,23 +37,11 @@ _PAIR_EXCESS = (1.25, 8.0)
 _TOP_SPEED_MPS = 44.0
 
 
-def draw_cases(
-    n: int,
-    seed: int,
-    *,
-    mix: Mapping[str, float] | None = None,
-    start: int = 0,
-    tiers: Sequence[str] = tuple(TIERS),
-    effects: Sequence[str] = tuple(EFFECTS),
-    outside: Literal["sealed", "calibration"] = "sealed",
-    seconds: float | None = None,
-    manoeuvre: str | None = None,
-    signals: Sequence[str] = SIGNALS,
-    recorder: Recording = "ideal",
-) -> Iterator[Case]:
-    """Cases `start` to `start + n - 1` of the set `seed`, one after another.
+def draw_cases(n: int, seed: int, **settings: Any) -> Iterator[Case]:
+    """The first `n` cases of the set `seed`, one after another.
 
-    Args: `mix`: shares of the kinds (default 25 % none, 40 % single, 20 % pair, 15 % outside), kept in every 20 cases;
+    `settings`: those of `draw_case`. `mix`: shares of the kinds (default 25 % none, 40 % single, 20 % pair, 15 %
+    outside), kept in every 20 cases;
     `several`: three to five causes of ordinary size (`several.py`), with the oracle's budget of the gap.
     `tiers`, `effects`: single cases cover all their combinations in random order; causes outside the table are drawn
     from all `tiers`. `outside`: which of the two groups of families outside the table. `seconds`, `manoeuvre`: fixed
@@ -71,19 +58,8 @@ def draw_cases(
         >>> [case.truth_name for case in draw_cases(2, seed=1, mix={"none": 1.0}, seconds=10.0)]
         ['none', 'none']
     """
-    for i in range(start, start + n):
-        yield draw_case(
-            i,
-            seed,
-            mix=mix,
-            tiers=tiers,
-            effects=effects,
-            outside=outside,
-            seconds=seconds,
-            manoeuvre=manoeuvre,
-            signals=signals,
-            recorder=recorder,
-        )
+    for i in range(n):
+        yield draw_case(i, seed, **settings)
 
 
 def draw_case(

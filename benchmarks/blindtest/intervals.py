@@ -1,13 +1,13 @@
-"""90 % intervals of test results: Wilson's for shares, the bootstrap for other measures."""
+"""What chance does to test results: Wilson's intervals of shares, the bootstrap, the error of probabilities."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from statistics import NormalDist
 
 import numpy as np
 
-from avtorch.arrays import IntArray
+from avtorch.arrays import FloatArray, IntArray
 
 Interval = tuple[float, float]
 LEVEL = 0.90
@@ -25,6 +25,14 @@ def wilson(hits: int, trials: int, level: float = LEVEL) -> Interval | None:
     half = z / (1 + weight) * np.sqrt(share * (1 - share) / trials + weight / (4 * trials))
     low = 0.0 if hits == 0 else float(middle - half)
     return low, 1.0 if hits == trials else float(middle + half)
+
+
+def counted(hits: int, of: int) -> str:
+    """How many of how many, with Wilson's 90 % interval of the share."""
+    between = wilson(hits, of)
+    return (
+        f"{hits} of {of}" if between is None else f"{hits} of {of} ({100 * between[0]:.0f} to {100 * between[1]:.0f} %)"
+    )
 
 
 HALF_WIDTH = 0.05
@@ -84,3 +92,30 @@ def bootstrap(
         return None
     low, high = np.quantile(known, [0.5 - level / 2, 0.5 + level / 2])
     return float(low), float(high)
+
+
+# How far probabilities are from the shares that turn out true, and how far few cases alone would put them.
+_DRAWS = 1000
+
+
+def calibration_error(probabilities: Sequence[float], true: Sequence[bool], bins: int = 10) -> float:
+    """Expected calibration error: mean distance of probability and share that is true, over equal bins."""
+    return float(_errors(np.array(probabilities), np.array(true, float)[None], bins)[0])
+
+
+def calibration_by_chance(probabilities: Sequence[float], bins: int = 10, *, seed: int = 0) -> float:
+    """The mean `calibration_error` where every one of these probabilities is exactly right.
+
+    A bin of few cases never has its share to the digit, so the error of calibrated probabilities is not 0: what they
+    say is drawn a thousand times (consistency resampling, Bröcker and Smith 2007).
+    """
+    stated = np.array(probabilities)
+    drawn = np.random.default_rng(seed).random((_DRAWS, len(stated))) < stated
+    return float(_errors(stated, drawn.astype(float), bins).mean())
+
+
+def _errors(stated: FloatArray, true: FloatArray, bins: int) -> FloatArray:
+    """Errors (draw,) of probabilities (case,), of which those are `true` (draw, case) that are 1 there."""
+    which = np.minimum((stated * bins).astype(int), bins - 1)
+    gaps = (stated - true) @ np.eye(bins)[which]  # (draw, bin)
+    return np.asarray(np.abs(gaps).sum(1) / len(stated))

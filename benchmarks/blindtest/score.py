@@ -13,9 +13,16 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from benchmarks.blindtest import budget_score as of_budget
 from benchmarks.blindtest.answers import Answered, read_answer
-from benchmarks.blindtest.calibration_error import calibration_by_chance, calibration_error
 from benchmarks.blindtest.deck import KINDS
-from benchmarks.blindtest.intervals import Interval, bootstrap, cases_for, cases_for_mean, wilson
+from benchmarks.blindtest.intervals import (
+    Interval,
+    bootstrap,
+    calibration_by_chance,
+    calibration_error,
+    cases_for,
+    cases_for_mean,
+    wilson,
+)
 from benchmarks.blindtest.parameter_score import found_sizes
 from benchmarks.blindtest.visibility import TIERS
 

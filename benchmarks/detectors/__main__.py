@@ -116,7 +116,7 @@ def main() -> None:
 def write(out: Path, answer: dict[str, object]) -> None:
     """The figures as JSON, and the operating curves drawn."""
     from avtorch.plots import save
-    from benchmarks.detectors.operating_curves import operating_figure
+    from benchmarks.detectors.tables import operating_figure
 
     out.mkdir(parents=True, exist_ok=True)
     (out / "detectors.json").write_text(json.dumps(answer, indent=1, default=str) + "\n", encoding="utf-8")

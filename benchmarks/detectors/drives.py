@@ -7,7 +7,6 @@ Beliefs are computed once per run; every detector gets the same ones.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -84,15 +83,7 @@ class Beliefs:
         return float(self.end_s[-1])
 
 
-def drive(
-    leader: Leader,
-    change: Change,
-    *,
-    runs: int,
-    first_seed: int,
-    duration: float,
-    progress: Callable[[float], None] | None = None,
-) -> Beliefs:
+def drive(leader: Leader, change: Change, *, runs: int, first_seed: int, duration: float) -> Beliefs:
     """`runs` closed loops in one batch behind `leader`, and the belief about each after every 2 s."""
     generator = torch.Generator().manual_seed(first_seed)
     moments = torch.rand(runs, generator=generator, dtype=torch.float64)
@@ -122,8 +113,6 @@ def drive(
             ends.append(window.end_s)
             statistics = report.statistics
             rows.append((used, statistics["stability"], statistics["accepted_change"], log.mean, log.cov))
-        if progress is not None:
-            progress(loop.time)
     used, p, sure, mean, cov = (torch.stack(column) for column in zip(*rows, strict=True))
     end = torch.tensor(ends, dtype=torch.float64)
     return Beliefs(end, at, used, p, sure, Gaussian(mean, cov), int(loop.collided.sum()))

@@ -28,7 +28,8 @@ from benchmarks.golden.facts import (
     tested_facts,
     timed,
 )
-from benchmarks.golden.recordings import first, folder
+from benchmarks.golden.recordings import first
+from benchmarks.recordings import folder
 
 TRAINING, OTHER_MASS = "roboracer/ftg_stanley_total_training.csv", "roboracer/single_mass.csv"
 

@@ -5,17 +5,15 @@ What has no `accel_cmd` is read through a map of its pedals, as the command line
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 
 from avtorch import diagnose
 from avtorch.io import Log, fingerprint
 from avtorch.pedals import fit_pedals
-from benchmarks.budgets import SETS
 from benchmarks.golden.facts import Answer, diagnosis_facts, timed
+from benchmarks.recordings import SETS, folder
 
 MOST_S = 300.0
 FILES: dict[str, tuple[str, ...]] = {
@@ -24,13 +22,6 @@ FILES: dict[str, tuple[str, ...]] = {
     "cpm_lab_ucar": ("cpm_lab_ucar/run.csv",),
     "f110_frictionmaps": ("f110_frictionmaps/ds5.csv",),
 }
-
-
-def folder() -> Path:
-    found = os.environ.get("AVTORCH_DATA")
-    if found is None:
-        raise SystemExit("AVTORCH_DATA: not set, needs the folder of the recordings")
-    return Path(found)
 
 
 def first(log: Log, seconds: float) -> Log:

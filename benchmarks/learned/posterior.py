@@ -21,8 +21,8 @@ from avtorch.inference import JerkStatistics, Posterior, integrate, sample
 from avtorch.inference.priors import Joint, default_actuation_prior, default_jerk_noise_prior
 from avtorch.validation.windows import simulate_windows
 from benchmarks.estimators import CHANGE_S, drive
+from benchmarks.peers.own import density_of
 from benchmarks.peers.problem import Windows
-from benchmarks.peers.torch_rows import density_of
 from benchmarks.rank_calibration import RankCalibration
 
 ROWS, DRAWS = 200, 1000
@@ -215,7 +215,7 @@ def by_window(module: str) -> Method:
     """A filter of the peers, window after window."""
     from importlib import import_module
 
-    runner = import_module(f"benchmarks.peers.{module}").build({})
+    runner = import_module(f"benchmarks.peers.{module}").Runner({})
 
     def run(windows: Windows) -> Told:
         each = [runner.run(windows.select(slice(k, k + 1)), 0) for k in range(len(windows))]

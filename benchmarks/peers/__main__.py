@@ -12,6 +12,7 @@ import json
 import os
 import platform
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.peers.aims import aims
@@ -82,7 +83,7 @@ def main(given: list[str] | None = None) -> int:
         if part:
             print("\nSettings\n" + "\n".join(details(part)))
     if o.json is not None:
-        results = {"one": [r.as_dict() for r in one], "many": [r.as_dict() for r in many], "growth": grown}
+        results = {"one": list(map(asdict, one)), "many": list(map(asdict, many)), "growth": grown}
         o.json.write_text(json.dumps({**results, "aims": verdicts}, indent=1) + "\n", encoding="utf-8")
     return 0
 

@@ -21,19 +21,15 @@ import numpy as np
 from blackjax.adaptation.laps import laps
 from blackjax.mcmc import mclmc
 
-from avtorch.arrays import FloatArray
 from benchmarks.peers.contract import Answer, Settings
-from benchmarks.peers.jax_density import log_densities, log_density, prior_center
+from benchmarks.peers.jax_density import OnSums, log_density, prior_center
 from benchmarks.peers.problem import Windows
 
 
-class Runner:
+class Runner(OnSums):
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._walk = jax.jit(partial(_walk, settings))
-
-    def log_density(self, windows: Windows, z: FloatArray) -> FloatArray:
-        return np.asarray(log_densities(z, windows.sums()[0]))
 
     def run(self, windows: Windows, seed: int) -> Answer:
         sampler = partial(_laps, self._settings)
@@ -87,7 +83,3 @@ def _laps(s: Settings, key: jax.Array, sums: jax.Array) -> jax.Array:
         diagnostics=False,
     )
     return result[-1].position[:, None]
-
-
-def build(settings: Settings) -> Runner:
-    return Runner(settings)

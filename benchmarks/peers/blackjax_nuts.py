@@ -18,30 +18,15 @@ from functools import partial
 import blackjax
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from avtorch.arrays import FloatArray
-from benchmarks.peers.contract import Answer, Settings
-from benchmarks.peers.jax_density import log_densities, log_density, mode, prior_center
-from benchmarks.peers.problem import Windows
+from benchmarks.peers.contract import Settings
+from benchmarks.peers.jax_density import Compiled, log_density, mode, prior_center
 
 
-class Runner:
+class Runner(Compiled):
     def __init__(self, settings: Settings) -> None:
         s = {"space": "z", "mode": False, "adapt": "chain", "burn_in": 0, "low_rank": False, **settings}
-        sampler = partial(_whitened if s["space"] == "whitened" else _adapted, s)
-        self._one, self._many = jax.jit(sampler), jax.jit(jax.vmap(sampler))
-
-    def log_density(self, windows: Windows, z: FloatArray) -> FloatArray:
-        return np.asarray(log_densities(z, windows.sums()[0]))
-
-    def run(self, windows: Windows, seed: int) -> Answer:
-        sums, key = windows.sums(), jax.random.key(seed)
-        if len(windows) == 1:
-            draws = np.asarray(self._one(key, sums[0]))[None]  # (window, chain, draw, 3)
-        else:
-            draws = np.asarray(self._many(jax.random.split(key, len(windows)), sums))
-        return Answer(np.exp(draws.transpose(1, 2, 0, 3)))
+        super().__init__(partial(_whitened if s["space"] == "whitened" else _adapted, s))
 
 
 def _adapted(s: Settings, key: jax.Array, sums: jax.Array) -> jax.Array:
@@ -96,7 +81,3 @@ def _scan(kernel, key: jax.Array, state, s: Settings) -> jax.Array:
         return state, state.position
 
     return jax.lax.scan(step, state, jax.random.split(key, s["burn_in"] + s["draws"]))[1][s["burn_in"] :]
-
-
-def build(settings: Settings) -> Runner:
-    return Runner(settings)

@@ -15,30 +15,14 @@ from functools import partial
 import blackjax
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from avtorch.arrays import FloatArray
-from benchmarks.peers.contract import Answer, Settings
-from benchmarks.peers.jax_density import log_densities, log_density, mode, stiffness
-from benchmarks.peers.problem import Windows
+from benchmarks.peers.contract import Settings
+from benchmarks.peers.jax_density import Compiled, log_density, mode, stiffness
 
 
-class Runner:
+class Runner(Compiled):
     def __init__(self, settings: Settings) -> None:
-        sampler = partial(_sample, settings)
-        self._random = settings["random"]
-        self._one, self._many = jax.jit(sampler), jax.jit(jax.vmap(sampler))
-
-    def log_density(self, windows: Windows, z: FloatArray) -> FloatArray:
-        return np.asarray(log_densities(z, windows.sums()[0]))
-
-    def run(self, windows: Windows, seed: int) -> Answer:
-        sums, key = windows.sums(), jax.random.key(seed, impl=self._random)
-        if len(windows) == 1:
-            draws = np.asarray(self._one(key, sums[0]))[None]  # (window, chain, draw, 3)
-        else:
-            draws = np.asarray(self._many(jax.random.split(key, len(windows)), sums))
-        return Answer(np.exp(draws.transpose(1, 2, 0, 3)))
+        super().__init__(partial(_sample, settings), settings["random"])
 
 
 def _sample(s: Settings, key: jax.Array, sums: jax.Array) -> jax.Array:
@@ -63,7 +47,3 @@ def _sample(s: Settings, key: jax.Array, sums: jax.Array) -> jax.Array:
     w, _ = jax.lax.scan(move, jnp.zeros((s["chains"], 3)), jax.random.split(key_burn, s["burn_in"]))
     _, w = jax.lax.scan(collect, w, jax.random.split(key_walk, s["draws"]))
     return center + w.transpose(1, 0, 2) @ scale.T
-
-
-def build(settings: Settings) -> Runner:
-    return Runner(settings)

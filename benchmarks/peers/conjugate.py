@@ -17,13 +17,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, Posterior
 from avtorch.inference.device import check_generator
-from benchmarks.peers.contract import Answer, Settings
+from benchmarks.peers.contract import Answer
+from benchmarks.peers.own import OwnDensity, density_of
 from benchmarks.peers.problem import Windows
-from benchmarks.peers.torch_rows import density_of, own_log_density
 
 #: Variance of the conjugate prior over that of the intended prior: the proposal must have the wider tails.
 WIDENING = 4.0
@@ -39,9 +38,6 @@ class Conjugate:
         posterior: ``(1, draw, window, 3)`` draws of ``(T_L [s], K_L [-], sigma [m/s^3])``, equally weighted; its
             ``converged`` is false where the effective sample size is below the least asked for.
         ess: effective sample size of the weighted proposals, ``(window,)``. Resampling adds nothing to it.
-        log_evidence: log integral of the density, ``(window,)``.
-        log_evidence_error: its standard error, ``(window,)``.
-        inside: share of the proposals on the positive quadrant, ``(window,)``; the others are rejected.
 
     Example:
         >>> import torch
@@ -54,9 +50,6 @@ class Conjugate:
 
     posterior: Posterior
     ess: Tensor
-    log_evidence: Tensor
-    log_evidence_error: Tensor
-    inside: Tensor
 
 
 def sample_conjugate(
@@ -115,8 +108,7 @@ def sample_conjugate(
     index = _systematic(weight, draws, generator)
     chosen = z.take_along_dim(index.unsqueeze(-1), 0).exp()
     posterior = Posterior(density.names, chosen.unsqueeze(0), ess >= least_ess)
-    evidence = peak + (total / proposals).log()
-    return Conjugate(posterior, ess, evidence, (1 / ess - 1 / proposals).clamp_min(0).sqrt(), inside.double().mean(0))
+    return Conjugate(posterior, ess)
 
 
 def _systematic(weight: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
@@ -181,18 +173,8 @@ class _NormalInverseGamma:
         return normal + inverse_gamma - self.rate / variance
 
 
-class Runner:
-    def __init__(self, settings: Settings) -> None:
-        self.settings = settings
-
-    def log_density(self, windows: Windows, z: FloatArray) -> FloatArray:
-        return own_log_density(windows, z)
-
+class Runner(OwnDensity):
     def run(self, windows: Windows, seed: int) -> Answer:
         generator = torch.Generator().manual_seed(seed)
         found = sample_conjugate(density_of(windows), generator=generator, **self.settings)
         return Answer(found.posterior.draws.numpy(), ess=found.ess.numpy())
-
-
-def build(settings: Settings) -> Runner:
-    return Runner(settings)

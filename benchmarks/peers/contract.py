@@ -54,22 +54,20 @@ class Method:
     Attributes:
         name: how ``--only`` names it.
         title: how the table names it.
-        module: under ``benchmarks.peers``; its ``build(settings)`` returns a :class:`Runner`.
+        runner: module and class of its :class:`Runner` under ``benchmarks.peers``.
         needs: modules that must be installed, and ``pip``: what installs them.
         candidates: settings for one window; of several the run keeps the fastest that is accurate, on windows of its
             own. ``draws`` (a chain), or what else ``scales`` names, is then scaled so that the worst parameter gets the
             effective draws wanted, unless ``fixed``.
         batch: settings for many windows at once, or ``None``; ``batch_windows``: at most so many. Where ``scales`` is
             not ``draws`` the settings found for one window are taken.
-        gets: what was done for its speed, in words.
-        same_density: whether it samples the common density; otherwise the table marks it.
         exact: the truth itself.
         slow: the number of windows is cut, and no trial is made.
     """
 
     name: str
     title: str
-    module: str
+    runner: str
     needs: tuple[str, ...] = ()
     pip: str = ""
     candidates: tuple[Settings, ...] = ({},)
@@ -77,8 +75,6 @@ class Method:
     scales: str = "draws"
     batch: Settings | None = None
     batch_windows: int = 1000
-    gets: str = ""
-    same_density: bool = True
     exact: bool = False
     slow: bool = False
 
@@ -87,7 +83,8 @@ class Method:
         return tuple(name for name in self.needs if find_spec(name) is None)
 
     def build(self, settings: Settings) -> Runner:
-        return import_module(f"benchmarks.peers.{self.module}").build(settings)
+        module, _, runner = self.runner.partition(".")
+        return getattr(import_module(f"benchmarks.peers.{module}"), runner)(settings)
 
 
 def moments(answer: Answer) -> tuple[FloatArray, FloatArray]:

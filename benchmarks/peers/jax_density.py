@@ -6,12 +6,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from benchmarks.peers.problem import LOG_SD, MEDIAN, SIGMA_SCALE
+from avtorch.arrays import FloatArray
+from benchmarks.peers.contract import Answer
+from benchmarks.peers.problem import LOG_SD, MEDIAN, SIGMA_SCALE, Windows
 
 _LOG_2PI = math.log(2 * math.pi)
 
@@ -75,8 +79,32 @@ def mode(sums: Array) -> tuple[Array, Array]:
     return z, basis / jnp.sqrt(jnp.maximum(jnp.abs(values), 1e-6))
 
 
-#: For the check against avtorch's own density.
-log_densities = jax.jit(jax.vmap(log_density, in_axes=(0, None)))
+_log_densities = jax.jit(jax.vmap(log_density, in_axes=(0, None)))
+
+
+class OnSums:
+    """A runner whose density is the one above."""
+
+    def log_density(self, windows: Windows, z: FloatArray) -> FloatArray:
+        """For the check against avtorch's own density."""
+        return np.asarray(_log_densities(z, windows.sums()[0]))
+
+
+class Compiled(OnSums):
+    """A sampler of one window from a key and its sums to draws of ``z``, ``(chain, draw, 3)``, compiled for one window
+    and for many at once; ``random``: JAX's generator."""
+
+    def __init__(self, sampler: Callable[[Array, Array], Array], random: str | None = None) -> None:
+        self._random = random
+        self._one, self._many = jax.jit(sampler), jax.jit(jax.vmap(sampler))
+
+    def run(self, windows: Windows, seed: int) -> Answer:
+        sums, key = windows.sums(), jax.random.key(seed, impl=self._random)
+        if len(windows) == 1:
+            draws = np.asarray(self._one(key, sums[0]))[None]  # (window, chain, draw, 3)
+        else:
+            draws = np.asarray(self._many(jax.random.split(key, len(windows)), sums))
+        return Answer(np.exp(draws.transpose(1, 2, 0, 3)))
 
 
 def prior_center() -> Array:

@@ -18,10 +18,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.inference import JerkDensity, JerkStatistics, Mode, SamplerSettings, find_mode, integrate, sample
+from avtorch.inference import (
+    JerkDensity,
+    JerkPoints,
+    JerkStatistics,
+    Mode,
+    SamplerSettings,
+    find_mode,
+    integrate,
+    jerk_log_likelihood,
+    sample,
+)
 from avtorch.inference.density import SubsampledDensity
 from benchmarks.bias.control_variates import ControlVariates
-from benchmarks.peers.pointwise import PointwiseDensity
 from benchmarks.peers.problem import make_windows
 from benchmarks.peers.score import WANTED
 
@@ -30,6 +39,40 @@ BATCHES = (32, 256, 2048)
 SD_RATIO = 1.04
 #: Runs of at most so many seconds are made; longer ones are computed from the seconds of a step.
 AFFORDABLE_S = 20.0
+
+
+class PointwiseDensity:
+    """The log density of `JerkPoints`, evaluated row by row also where the whole window is asked for."""
+
+    names = ("T_L", "K_L", "sigma")
+
+    def __init__(self, a: Tensor, u: Tensor, jerk: Tensor) -> None:
+        self._rows = (a, u, jerk)
+        self._points = JerkPoints(a, u, jerk)
+
+    @property
+    def windows(self) -> int:
+        return self._points.windows
+
+    @property
+    def points(self) -> int:
+        return self._points.points
+
+    def constrain(self, z: Tensor) -> Tensor:
+        return z.exp()
+
+    def select(self, index: Tensor) -> PointwiseDensity:
+        return PointwiseDensity(*(x[index] for x in self._rows))
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        return self._points.prior.log_prob(z) + jerk_log_likelihood(*z.exp().unbind(-1), *self._rows)
+
+    def log_prob_minibatch(self, z: Tensor, index: Tensor) -> Tensor:
+        part = jerk_log_likelihood(*z.exp().unbind(-1), *(x[:, index] for x in self._rows))
+        return self._points.prior.log_prob(z) + self.points / len(index) * part
+
+    def initial(self) -> Tensor:
+        return self._points.initial()
 
 
 def minibatch(points: int, *, quick: bool = False) -> list[dict[str, Any]]:

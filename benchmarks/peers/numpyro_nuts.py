@@ -70,7 +70,3 @@ def _sample(s: Settings, key: jax.Array, sums: jax.Array) -> jax.Array:
         return jax.lax.scan(step, state, None, length=s["warmup"] + s["draws"])[1][s["warmup"] :]
 
     return jax.vmap(chain)(jax.random.split(key, s["chains"]))
-
-
-def build(settings: Settings) -> Runner:
-    return Runner(settings)

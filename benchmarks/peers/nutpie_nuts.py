@@ -61,7 +61,3 @@ class Runner:
         )
         found = trace["posterior"]
         return Answer(np.stack([np.asarray(found[name]) for name in NAMES], -1)[:, :, None])
-
-
-def build(settings: Settings) -> Runner:
-    return Runner(settings)

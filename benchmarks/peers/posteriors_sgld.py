@@ -11,20 +11,13 @@ import posteriors
 import torch
 from torch import Tensor
 
-from avtorch.arrays import FloatArray
 from avtorch.inference import JerkDensity, Mode, find_mode
-from benchmarks.peers.contract import Answer, Settings
+from benchmarks.peers.contract import Answer
+from benchmarks.peers.own import OwnDensity, density_of
 from benchmarks.peers.problem import Windows
-from benchmarks.peers.torch_rows import density_of, own_log_density
 
 
-class Runner:
-    def __init__(self, settings: Settings) -> None:
-        self.settings = settings
-
-    def log_density(self, windows: Windows, z: FloatArray) -> FloatArray:
-        return own_log_density(windows, z)
-
+class Runner(OwnDensity):
     def run(self, windows: Windows, seed: int) -> Answer:
         s, density = self.settings, density_of(windows)
         torch.manual_seed(seed)  # posteriors draws from the global generator
@@ -56,7 +49,3 @@ def _stiffness(density: JerkDensity, mode: Mode, radius: float = 3.0) -> Tensor:
     (gradient,) = torch.autograd.grad(potential.sum(), probes)
     slope = (gradient * probes.detach()).sum(-1) / radius**2
     return slope.nan_to_num(posinf=1e6).amax(0).clamp(1.0, 1e6)
-
-
-def build(settings: Settings) -> Runner:
-    return Runner(settings)

@@ -13,6 +13,8 @@ from benchmarks.peers.problem import Windows
 
 
 class Runner:
+    def __init__(self, settings: Settings) -> None: ...
+
     def log_density(self, windows: Windows, z: FloatArray) -> None:
         return None
 
@@ -40,7 +42,3 @@ class Runner:
             mean=np.stack([lag, gain, nothing], -1),
             sd=np.stack([np.sqrt(variance[0]), np.sqrt(variance[1]), nothing], -1),
         )
-
-
-def build(settings: Settings) -> Runner:
-    return Runner()

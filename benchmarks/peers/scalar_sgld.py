@@ -84,7 +84,3 @@ def _mode(rows: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         better = bool(potential(trial) <= potential(z))
         z, damping = (trial, min(1.0, 2 * damping)) if better else (z, damping / 4)
     return z, torch.func.hessian(potential)(z)
-
-
-def build(settings: Settings) -> Runner:
-    return Runner(settings)

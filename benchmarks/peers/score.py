@@ -30,7 +30,7 @@ class Exact:
     @classmethod
     def of(cls, windows: Windows) -> Exact:
         from avtorch.inference import integrate
-        from benchmarks.peers.torch_rows import density_of
+        from benchmarks.peers.own import density_of
 
         parts = [integrate(density_of(windows.select(slice(k, k + 10)))) for k in range(0, len(windows), 10)]
         if not all(bool(part.converged.all()) for part in parts):

@@ -6,17 +6,17 @@ import json
 import math
 import sys
 import tempfile
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.peers.contract import Method, Settings, as_log
+from benchmarks.peers.own import own_log_density
 from benchmarks.peers.problem import make_windows
 from benchmarks.peers.process import PeerFailed, Worker
 from benchmarks.peers.score import WANTED, Exact, Score, median, seconds_to
-from benchmarks.peers.torch_rows import own_log_density
 
 TRIAL_WINDOWS = 3
 #: Draws are scaled to this many times the effective draws wanted on the worst trial window.
@@ -57,9 +57,6 @@ class Row:
     peak_mb: float = math.nan
     density_error: float | None = None
     trials: list[dict[str, Any]] = field(default_factory=list)
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def say(text: str) -> None:

@@ -14,6 +14,8 @@ from benchmarks.peers.problem import LOG_SD, MEDIAN, FloatArray, Windows
 
 
 class Runner:
+    def __init__(self, settings: Settings) -> None: ...
+
     def log_density(self, windows: Windows, z: FloatArray) -> None:
         return None
 
@@ -37,7 +39,3 @@ class Runner:
         mean = np.exp(kalman.x + 0.5 * variance)
         sd = mean * np.sqrt(np.expm1(variance))
         return Answer(mean=np.append(mean, np.nan)[None], sd=np.append(sd, np.nan)[None])
-
-
-def build(settings: Settings) -> Runner:
-    return Runner()

@@ -67,7 +67,3 @@ class Runner:
             max_sampling_iter=s["draws"],
         )
         return Answer(np.exp(np.stack([np.asarray(chain)[..., -3:] for chain in found])[:, :, None]))
-
-
-def build(settings: Settings) -> Runner:
-    return Runner(settings)

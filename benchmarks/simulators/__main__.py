@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.blindtest.intervals import wilson
-from benchmarks.simulators.answers import WAYS, answered
-from benchmarks.simulators.cases import behind_a_recorder, draw
+from benchmarks.simulators.cases import WAYS, answered, behind_a_recorder, draw
 
 KINDS = ("none", "parameter", "effect")
 

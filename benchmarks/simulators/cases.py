@@ -9,17 +9,23 @@ on a drive are drawn anew.
 
 from __future__ import annotations
 
+import tempfile
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from avtorch import Log
+from avtorch import ExternalSimulator, Log, diagnose
 from avtorch.arrays import FloatArray
+from avtorch.external import FmuSimulator
+from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.io import STANDSTILL_MPS
 from benchmarks.blindtest import EFFECTS, Car, draw_car, draw_drive, draw_recorder, simulate
-from benchmarks.blindtest.strength import excess_range, solve_strength
+from benchmarks.blindtest.several import excess_range, solve_strength
+from benchmarks.simulators.fmu import write_fmu
 from benchmarks.simulators.vehicle import Effects, SteppedVehicle, whole_drive
 
 SECONDS, RATE_HZ = 100.0, 50
@@ -137,3 +143,68 @@ def behind_a_recorder(case: Mapping[str, Any], seed: int) -> dict[str, Any]:
     drawn = draw_recorder(np.random.default_rng((seed, case["number"], 1)), RATE_HZ)
     recorder = replace(drawn, dropped=0.0, overrides_per_min=0.0)
     return {**case, "log": recorder.record(case["log"], case["number"])}
+
+
+# What a diagnosis says of a case, by each way to bring a simulator, and whether that is right.
+WAYS = ("output", "object", "fmu")
+
+
+def answered(case: Mapping[str, Any], by: str) -> dict[str, Any]:
+    log, vehicle = case["log"], case["vehicle"]
+    begun, wall = time.process_time(), time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        if by == "output":
+            baseline = ExternalSimulator(_output(vehicle, log))
+        elif by == "object":
+            baseline = ExternalSimulator(vehicle)
+        else:
+            file = write_fmu(vehicle, Path(folder, "vehicle.fmu"), 1 / RATE_HZ)
+            baseline = ExternalSimulator(FmuSimulator(file))
+        found = diagnose(log, baseline=baseline, posterior="laplace")
+    row = {key: case[key] for key in ("number", "kind", "cause")} | {"by": by}
+    spent = {"seconds": time.process_time() - begun, "wall": time.monotonic() - wall}
+    return row | judged(case, found) | spent
+
+
+def _output(vehicle: SteppedVehicle, log: Log) -> Log:
+    assert log.accel_cmd is not None
+    assert log.speed is not None
+    accel, speed = whole_drive(vehicle.car, vehicle.effects, log.accel_cmd[:-1], RATE_HZ, speed=float(log.speed[0]))
+    return Log.from_arrays(
+        name="simulator", time=log.time[1:], accel_cmd=log.accel_cmd[1:], accel=accel, speed=np.maximum(speed, 0.0)
+    )
+
+
+def judged(case: Mapping[str, Any], found: Diagnosis) -> dict[str, Any]:
+    """Whether the verdict is right, and whether it is of the right kind.
+
+    Right is what the answer says of the simulator: what it lacks, or which parameter is wrong. `nothing_else`: neither
+    is anything else named, such as a gust, which is the car's and by chance, or another parameter.
+    """
+    facts = found.tested
+    assert facts is not None
+    wrong = {p.name.partition(".")[0] for p in facts.wrong}
+    named = set(facts.missing)
+    kind = "effect" if named else "parameter" if wrong else "unknown" if found.verdict.abstained else "none"
+    alike = {part for alias in found.verdict.alias_set for part in alias.split("+")}
+    cause = case["cause"]
+    right = {
+        "none": kind == "none",
+        "effect": named == {cause},
+        "parameter": kind == "parameter" and cause in wrong,
+    }[case["kind"]]
+    besides = {"none": set(), "effect": {cause}, "parameter": {cause} - {"K_L"}}[case["kind"]]
+    alone = set(found.verdict.names) - {"none"} == besides and wrong <= (
+        {cause} if case["kind"] == "parameter" else set()
+    )
+    return {
+        "answer": list(found.verdict.names),
+        "missing": sorted(named),
+        "wrong": sorted(wrong),
+        "answered_kind": kind,
+        "right": right,
+        "nothing_else": right and alone,
+        "right_kind": kind == case["kind"],
+        "in_alias_set": right or (case["kind"] == "effect" and cause in alike),
+        "left": max(facts.left.values()),
+    }

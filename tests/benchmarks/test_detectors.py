@@ -1,4 +1,4 @@
-"""One pass serves every threshold: first alarms are those of the monitor itself, detector by detector."""
+"""Detectors compared: one pass serves every threshold; and curves as drawn."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import math
 
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 from avtorch.decision.divergence import Gaussian
 from avtorch.decision.monitor import Monitor
 from avtorch.decision.settings import Setting
+from avtorch.errors import InputError
 from benchmarks.detectors.drives import Beliefs
 from benchmarks.detectors.judge import DETECTORS, first_alarm, scores
-from benchmarks.detectors.tables import Quiet, alarms, chosen, delays, found, quiet
+from benchmarks.detectors.tables import Quiet, chosen, found, operating_curve, operating_figure, quiet
 
 RUNS, WINDOWS = 80, 34
 
@@ -81,11 +83,12 @@ def test_the_readiest_quiet_value_is_chosen() -> None:
     assert chosen({"healthy": (beliefs, score)}, 0.1)["kl"] == 0.1
 
 
-def test_tables_have_a_row_a_detector_and_a_column_a_kind() -> None:
-    row = {"detector": "kl", "value": None}
-    none = {"alarmed": 0, "runs": 200, "interval": (0.0, 0.0189), "per_hour": 0.0}
-    late = {"runs": 200, "early": 100, "median_s": 2.0, "soon": 50, "at_all": 100}
-    told = alarms([{**row, "healthy": none}], ["healthy"]).splitlines()
-    assert told == ["| detector | set to | healthy |", "|---|---|---|", "| kl | defaults | 0 % (0.0 to 1.9) |"]
-    assert delays([{**row, "abrupt": late}], ["abrupt"]).endswith("| 2.0 s; 50 %, 100 %; 100 early |")
-    assert "no run without an early alarm" in delays([{**row, "abrupt": {**late, "early": 200}}], ["abrupt"])
+def test_operating_curves_leave_out_what_is_not_found() -> None:
+    inf = float("inf")
+    panels = {"drift": {"kl": [(0.1, 0.9, 2.0), (0.01, 0.1, 4.0)], "stability": [(0.9, 0.0, inf)]}}
+    figure = operating_figure(panels)
+    (line,) = figure.axes[0].lines
+    assert list(line.get_xdata()) == [0.9, 0.1]
+    assert list(line.get_ydata()) == [2.0, 4.0]
+    with pytest.raises(InputError, match="curves"):
+        operating_curve(Figure().subplots(), {})

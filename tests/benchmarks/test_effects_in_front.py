@@ -9,7 +9,8 @@ import pytest
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.budget import Budget, ChancePart, Part, Unexplained
 from benchmarks.blindtest import IN_FRONT
-from benchmarks.budget_cells import causes, counted
+from benchmarks.blindtest.intervals import counted
+from benchmarks.budget_cells import causes
 from benchmarks.effects_in_front import HEADER, InFront, Size, closing, compared, in_front
 from tests.gap.engine.recorded import recorded_log
 

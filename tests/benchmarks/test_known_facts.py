@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.budgets import SETS
 from benchmarks.known_facts import FACTS, HEADER, closing, told
+from benchmarks.recordings import SETS
 from tests.benchmarks.test_effects_in_front import made, part
 
 

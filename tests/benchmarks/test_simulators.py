@@ -9,7 +9,7 @@ import pytest
 
 from avtorch.external import FmuSimulator
 from benchmarks.blindtest import Car
-from benchmarks.simulators.answers import WAYS
+from benchmarks.simulators.cases import WAYS
 from benchmarks.simulators.fmu import write_fmu
 from benchmarks.simulators.vehicle import OWN, SteppedVehicle, whole_drive
 

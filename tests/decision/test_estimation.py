@@ -1,5 +1,8 @@
-"""`estimate` on logs of a known vehicle: what it recovers, what it leaves out, and what it refuses."""
+"""`estimate` on logs of known vehicles and on recordings: what it recovers, what it leaves out, and what it refuses."""
 
+from __future__ import annotations
+
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,10 +10,13 @@ import pytest
 import torch
 
 from avtorch.decision import Estimates, Monitor, Setting, estimate
+from avtorch.decision.dead_time import GRID_S
 from avtorch.decision.estimation import _delayed
 from avtorch.errors import InputError
+from avtorch.inference.latent_model import discretise
 from avtorch.inference.sampler import SamplerSettings
 from avtorch.io import Log
+from avtorch.pedals import fit_pedals
 from avtorch.results import estimates_answer
 from avtorch.vehicle import GLVDPlant, Leader, simulate
 from tests.bars import BAR
@@ -240,6 +246,10 @@ def test_behind_a_recorded_leader_rest_and_cruise_teach_nothing(data_dir):
         ({"forgetting": 0.0}, "forgetting"),
         ({"monitor": Monitor(2)}, "monitor"),
         ({"setting": Setting(scenarios=2)}, "setting"),
+        ({"estimator": "oracle"}, "sgld, importance, map, rls, ekf, ukf"),
+        ({"dead_time": -0.1}, "dead_time: found"),
+        ({"dead_time": 2.0}, "dead_time: found"),
+        ({"dead_time": float("nan")}, "dead_time: found"),
     ],
 )
 def test_what_is_refused(healthy, change, message):
@@ -275,11 +285,6 @@ def test_other_estimators_answer_in_the_same_terms(estimator, healthy):
     for name, truth in (("T_L", 0.5), ("K_L", 0.9)):
         assert last[name]["q05"] < last[name]["mean"] < last[name]["q95"]
         assert abs(last[name]["mean"] - truth) < 5 * last[name]["sd"]
-
-
-def test_an_unknown_estimator_is_refused(healthy):
-    with pytest.raises(InputError, match="sgld, importance, map, rls, ekf, ukf"):
-        estimate(healthy, estimator="oracle")
 
 
 @pytest.mark.slow
@@ -319,12 +324,6 @@ def test_a_dead_time_between_rows_takes_the_mean_of_what_acts():
     np.testing.assert_allclose(command, [0.0, 0.0, 0.0, 1.0, 1.0, 3.0], atol=1e-12)
     assert known.tolist() == [False, False, True, True, True, True]
     assert _delayed(log, 0.0)[0].tolist() == [0.0, 1.0, 1.0, 3.0, 3.0, 3.0]
-
-
-@pytest.mark.parametrize("seconds", [-0.1, 2.0, float("nan")])
-def test_a_dead_time_out_of_range_is_refused(healthy, seconds):
-    with pytest.raises(InputError, match="dead_time: found"):
-        estimate(healthy, dead_time=seconds)
 
 
 @pytest.mark.slow
@@ -371,3 +370,109 @@ def test_a_log_of_which_no_row_counts_is_refused(healthy):
     given = columns(healthy) | {"engaged": np.zeros(healthy.rows)}
     with pytest.raises(InputError, match=r"has no row to use; all are driven by hand \(engaged 0\)"):
         estimate(Log.from_arrays(**given), 4.0, estimator="map")
+
+
+# The dead time of a log, from its likelihood.
+def driven(dead_time: float, seed: int, *, jitter: float = 0.0, seconds: float = 40.0, rate: float = 50.0) -> Log:
+    """Speed of a car with T_L 0.3 s and K_L 0.9 that obeys steps of the command ``dead_time`` [s] later."""
+    random = np.random.default_rng(seed)
+    rows, late = int(seconds * rate), round(dead_time * rate)
+    time = (np.arange(rows) + jitter * random.uniform(-1, 1, rows)) / rate
+    u = random.normal(size=rows)[np.cumsum(random.random(rows) < 1.0 / rate)]
+    obeyed = np.concatenate([np.zeros(late), u[: rows - late]])
+    steps = torch.from_numpy(np.diff(time))
+    values = (torch.tensor(x, dtype=torch.float64) for x in (0.3, 0.9, 0.1, 0.005, 0.1, 1.5))
+    step = discretise(*values, steps)
+    root = torch.linalg.cholesky(step.noise + 1e-18 * torch.eye(4)).numpy()
+    phi, gain = step.transition.numpy(), step.gain.numpy()
+    x, speed = np.array([20.0, 0.0, 0.0, 0.1 * random.normal()]), []
+    for k in range(rows):
+        speed.append(x[0] + x[2] + 0.01 * random.normal())
+        if k + 1 < rows:
+            x = phi[k] @ x + gain[k] * obeyed[k] + root[k] @ random.normal(size=4)
+    return Log.from_arrays(time=time - time[0], accel_cmd=u, speed=np.array(speed))
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+@pytest.mark.parametrize("jitter", [0.0, 0.2])
+def test_a_dead_time_is_found_and_the_lag_behind_it(jitter: float, rotating_seed: int) -> None:
+    found = estimate(driven(0.2, rotating_seed, jitter=jitter), window=10.0, dead_time=None, seed=rotating_seed)
+    assert found.inferred is not None
+    # a step of the command falls anywhere within a row's 20 ms where the clock jitters
+    assert abs(found.dead_time - 0.2) < 0.04
+    assert found.inferred.nats > 10.0
+    last = found.windows[-1].window.belief.stat("T_L")
+    assert abs(last["mean"] - 0.3) < 5 * last["sd"] + 0.04
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+def test_none_is_claimed_where_there_is_none(rotating_seed: int) -> None:
+    found = estimate(driven(0.0, rotating_seed), window=10.0, dead_time=None, seed=rotating_seed)
+    assert found.inferred is not None
+    assert found.dead_time == 0.0
+    assert 0.0 <= found.inferred.q05 <= found.inferred.q95 < GRID_S[2]
+
+
+def test_a_given_dead_time_is_not_inferred(fresh_seed: int) -> None:
+    found = estimate(driven(0.0, fresh_seed, seconds=8.0), window=4.0, dead_time=0.1, estimator="map")
+    assert found.inferred is None
+    assert found.dead_time == 0.1
+
+
+# The latent form on a real car: a Hyundai Genesis, commanded acceleration and measured speed, three laps.
+@pytest.fixture(scope="module")
+def laps(data_dir: Path) -> list[Estimates]:
+    return [estimate(Log.read(data_dir / "genesis" / f"lap{i}.csv"), window=10.0) for i in (1, 2, 3)]
+
+
+def excited(found: Estimates, name: str) -> np.ndarray:
+    """``(window, 2)``: mean and SD of a parameter over the whole 10 s windows that were used."""
+    rows = []
+    for w in found.windows:
+        belief = w.window.belief
+        if bool(belief.excited[0] & belief.converged[0]) and int(w.window.n[0]) > 950:
+            stat = belief.stat(name)
+            rows.append((stat["mean"], stat["sd"]))
+    return np.array(rows)
+
+
+@pytest.mark.slow
+def test_lag_and_gain_of_the_genesis(laps: list[Estimates]) -> None:
+    """Lag and delay together are about 0.32 s there, the gain about 0.96, by whole-lap fits of others."""
+    T, K = (np.concatenate([excited(lap, name) for lap in laps]) for name in ("T_L", "K_L"))
+    assert len(T) >= 9
+    assert abs(np.median(T[:, 0]) - 0.32) <= 0.06
+    assert abs(np.median(K[:, 0]) - 0.96) <= 0.05
+    medians = [np.median(excited(lap, "T_L")[:, 0]) for lap in laps]
+    assert max(medians) - min(medians) <= 0.08
+
+
+@pytest.mark.slow
+def test_spread_of_windows_is_relative_to_their_posteriors(laps: list[Estimates]) -> None:
+    """Spread over posterior SD: about 1 for the lag; about 2 for the gain, which differs along the lap (see README)."""
+    T, K = (np.concatenate([excited(lap, name) for lap in laps]) for name in ("T_L", "K_L"))
+    ratio_T, ratio_K = (x[:, 0].std(ddof=1) / np.median(x[:, 1]) for x in (T, K))
+    print(f"spread over posterior SD: T_L {ratio_T:.2f}, K_L {ratio_K:.2f}")
+    assert ratio_T <= 1.5
+    # 1.5 is the aim; the bar is today's value plus a tenth, so that a regression is detected
+    assert ratio_K <= 2.2
+
+
+@pytest.mark.slow
+def test_lag_and_gain_of_the_av21(data_dir: Path) -> None:
+    """Behind the filter of its accelerometer, of 2.5 s, the lag seems 3.7 s; on its map's commands it is 0.2 s."""
+    file = data_dir / "indy_av21" / "Putnam_park2023_run4_2.csv"
+    log = Log.read(file, map=["throttle=throttle_pct", "brake=brake_kPa"], unit=["throttle=%", "brake=kPa"])
+    fit = fit_pedals(log)
+    found = estimate(fit.map.commanded(log), dead_time=None)
+    assert found.late is not None
+    assert not found.late.recoverable
+    used = [w.window.belief for w in found.windows if bool(w.window.belief.excited[0] & w.window.belief.converged[0])]
+    lag, gain = (float(np.median([belief.stat(name)["mean"] for belief in used])) for name in ("T_L", "K_L"))
+    assert len(used) > 20
+    # the map's own lag, 0.07 s, is less than that by five of its standard errors, which are too small here
+    assert abs(lag + found.dead_time - fit.map.T_L - fit.map.dead_time) < 0.15
+    # the map's own gain is 1; that of 37 windows of 2 s has a spread of a sixth, so 5 sigma of their median
+    assert abs(gain - 1) < 5 * 1.25 * 0.17 / np.sqrt(len(used))

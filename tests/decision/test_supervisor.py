@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from avtorch.decision import Grid, History, Monitor, Setting, Strategist, Supervisor
+from avtorch.decision import Grid, Monitor, Setting, Strategist, Supervisor
 from avtorch.decision.supervisor import HISTORY_S, read_setting
 from avtorch.errors import InputError
 from avtorch.inference import BeliefStream
@@ -514,8 +514,3 @@ def test_parts_that_do_not_go_together_are_refused():
         Supervisor(make_loop(2), setting=Setting(scenarios=3))
     with pytest.raises(InputError, match="ends at"):
         Supervisor(make_loop(leader=Leader.constant(20.0, 5.0))).run(10.0)
-
-
-def test_a_history_needs_two_rows():
-    block = make_loop().advance(2)
-    assert History.of_blocks([block]).seconds == pytest.approx(0.01)

@@ -119,22 +119,6 @@ def test_a_saved_state_stays_as_it_was(blocks):
     assert_alike(first, drive(again, blocks, first=7)[1])
 
 
-def test_without_the_monitors_state_it_would_not_be_the_same(blocks, uncut):
-    """The test above can fail: an acceptance lost on the way shows."""
-    watch, whole = uncut
-
-    def forget(watch, i):
-        if i == 9:
-            watch.monitor = Monitor(2, detectors=DETECTORS)
-        return watch
-
-    _, other = drive(make(), blocks, between=forget)
-    with pytest.raises(AssertionError):
-        assert_alike(whole, other)
-    assert float(watch.monitor.accepted[0][0]) == pytest.approx(1.5, abs=0.4)
-    assert float(watch.monitor.accepted[0][1]) == 0.3
-
-
 def test_a_flushed_window_is_watched_too(blocks):
     watch = make()
     _, windows = drive(watch, blocks[:5])

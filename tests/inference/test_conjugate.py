@@ -33,9 +33,7 @@ def priors() -> dict:
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", list(priors()))
-def test_draws_and_evidence_are_those_of_quadrature(
-    name: str, make_windows, rotating_seed: int, draws_factor: int
-) -> None:
+def test_draws_are_those_of_quadrature(name: str, make_windows, rotating_seed: int, draws_factor: int) -> None:
     w = make_windows(rotating_seed, [0.05, 0.4, 3.0], T=0.3, K=0.9, sigma=0.12)
     density = JerkDensity(w.statistics, priors()[name])
     exact = integrate(density)
@@ -53,18 +51,8 @@ def test_draws_and_evidence_are_those_of_quadrature(
     for q in (0.05, 0.5, 0.95):
         below = (found.posterior.flat < exact.quantile(q)).double().mean(0)
         assert ((below - q).abs() < BAR * error * (q * (1 - q)) ** 0.5).all()
-    assert ((found.log_evidence - exact.log_evidence).abs() < BAR * found.log_evidence_error + 1e-6).all()
     # and the comparison is worth making
     assert error.max() < 0.06
-
-
-@pytest.mark.statistical
-def test_weights_of_the_wrong_prior_are_seen(make_windows, rotating_seed: int) -> None:
-    """The comparison above has teeth: another prior's draws fail it in the weak window."""
-    w = make_windows(rotating_seed, [0.05] * WINDOWS, T=0.3, K=0.9, sigma=0.12)
-    exact = integrate(JerkDensity(w.statistics, priors()["posterior"]))
-    other = sample_conjugate(JerkDensity(w.statistics), generator=torch.Generator().manual_seed(rotating_seed))
-    assert (((other.posterior.mean - exact.mean) / exact.sd).abs()[:, 0] > BAR * (2 / other.ess).sqrt()).any()
 
 
 @pytest.mark.statistical
@@ -82,7 +70,6 @@ def test_least_squares_of_negative_lag(rotating_seed: int) -> None:
     found = sample_conjugate(
         density, proposals=400_000, draws=8000, generator=torch.Generator().manual_seed(rotating_seed)
     )
-    assert found.inside < 0.7
     assert found.posterior.converged.all()
     assert (found.posterior.draws > 0).all()
     error = (1 / found.ess + 1 / 8000).sqrt()[:, None]

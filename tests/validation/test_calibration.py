@@ -1,23 +1,41 @@
-"""Simulation-based calibration: of exact toys, of toys with a fault, of windows and of the loop.
-
-p-values are Bonferroni's over all quantities and tests, so each is one comparison.
-"""
+"""Calibration: uniform ranks, SBC of a window and of the loop, and the loop against one inference on all windows."""
 
 from __future__ import annotations
 
 import math
+import warnings
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference import ExcitationRule, JerkDensity
+from avtorch.inference import ExcitationRule, JerkDensity, JerkStatistics, integrate
 from avtorch.inference.priors import LogNormalPrior
 from avtorch.validation.windows import simulate_windows
 from benchmarks.calibration import sbc, sbc_loop
 from benchmarks.peers.conjugate import sample_conjugate
-from benchmarks.rank_calibration import RankCalibration, sbc_quadrature
+from benchmarks.pooled import (
+    FreeNoise,
+    PooledComparison,
+    constant,
+    drift,
+    pool,
+    step,
+    track_loop,
+    truth_given_all,
+    windows_of,
+)
+from benchmarks.rank_calibration import (
+    RankCalibration,
+    bonferroni,
+    chi2_p_value,
+    dispersion_p_value,
+    ecdf_band,
+    ecdf_p_value,
+    sbc_quadrature,
+)
 from benchmarks.sine_windows import sine_commands, statistics
 from tests.bars import BAR, LEVEL
 
@@ -169,6 +187,194 @@ def test_a_prior_that_claims_too_much_is_seen(rotating_seed):
     assert found[1].p_value < 1e-4
 
 
+def test_statistics_are_those_of_the_samples():
+    z = torch.tensor([[0.3, 1.0, 0.5]], dtype=F64).log()
+    one, other = (statistics(z, rows=50, generator=torch.Generator().manual_seed(1)) for _ in range(2))
+    assert one.jj.equal(other.jj)
+    assert one.n.tolist() == [50]
+
+
+# Tests of uniform ranks: their level, the band, arviz beside it.
+RUNS, N, DRAWS = 2000, 300, 19
+
+
+@pytest.fixture
+def uniform(rotating_seed, draws_factor) -> torch.Tensor:
+    """Runs as quantities, so that one call tests them all."""
+    return torch.from_numpy(np.random.default_rng(rotating_seed).integers(0, DRAWS + 1, (N, RUNS * draws_factor)))
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+@pytest.mark.parametrize("test", [chi2_p_value, ecdf_p_value, dispersion_p_value])
+def test_level_is_kept(test, uniform):
+    p = test(uniform, DRAWS)
+    for level in (0.01, 0.05, 0.5):
+        rejected = float((p <= level).double().mean())
+        error = (level * (1 - level) / uniform.shape[1]) ** 0.5
+        # counts are discrete, chi^2 and the normal are limits: a tenth of the level for that
+        assert rejected <= 1.1 * level + BAR * error
+        assert rejected >= 0.7 * level - BAR * error
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+@pytest.mark.parametrize("level", [0.5, 0.95])
+def test_band_holds_all_points_as_often_as_it_says(level, uniform):
+    low, high = ecdf_band(N, DRAWS, level=level)
+    counts = torch.stack([torch.bincount(r, minlength=DRAWS + 1) for r in uniform.T])
+    ecdf = counts.cumsum(-1).double() / N
+    inside = ((ecdf >= low - 1e-12) & (ecdf <= high + 1e-12)).all(-1)
+    error = BAR * (level * (1 - level) / uniform.shape[1]) ** 0.5
+    assert -error <= float(inside.double().mean()) - level <= 0.05 + error
+    # the band and the p-value are one test
+    assert ((ecdf_p_value(uniform, DRAWS) > 1 - level) == inside).double().mean() > 0.98
+
+
+@pytest.mark.slow
+def test_band_of_arviz_is_the_same():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # arviz announces its successor
+        ecdf_utils = pytest.importorskip("arviz.stats.ecdf_utils")
+        at = np.arange(1, 100) / 100
+        expected = ecdf_utils.ecdf_confidence_band(500, at, at, prob=0.95, method="optimized")
+    for ours, theirs in zip(ecdf_band(500, 99, level=0.95), expected, strict=True):
+        # counts: which side of a step a bound lies on may differ
+        assert np.abs(ours.numpy()[:-1] - theirs).max() <= 1.001 / 500
+
+
+def test_small_case_by_enumeration():
+    """Two ranks out of 0, 1, 2, all nine pairs: p-values are shares of pairs at least as unlikely."""
+    pairs = torch.cartesian_prod(torch.arange(3), torch.arange(3)).T  # (replication, run)
+    p = ecdf_p_value(pairs, 2)
+    # at ranks 0 and 1 the counts are binomial(2, 1/3) and (2, 2/3); the extremes 2 and 0 have tail 1/9 each
+    extreme = (pairs == 0).all(0) | (pairs == 2).all(0)
+    assert p[extreme].tolist() == pytest.approx([2 / 9] * 2)
+    assert (p[~extreme] > 2 / 9 + 1e-9).all()
+
+
+@pytest.mark.statistical
+def test_wrong_spread_and_wrong_place_are_seen(rotating_seed):
+    """By normal scores stretched by 1.1 and shifted by 0.2: far below any level at 20 000 ranks."""
+    g = torch.Generator().manual_seed(rotating_seed)
+    score = torch.randn(20_000, generator=g, dtype=torch.float64)
+    pit = torch.special.ndtr(torch.stack([1.1 * score, score / 1.1, score + 0.2], -1))
+    ranks = (pit * 100).long()
+    assert (chi2_p_value(ranks, 99) < 1e-6).all()
+    assert (ecdf_p_value(ranks, 99) < 1e-6).all()
+    spread = dispersion_p_value(ranks, 99)
+    assert (spread[:2] < 1e-6).all()
+
+
+def test_ranks_beyond_all_doubt():
+    """All truths above all draws: tails that underflow are no obstacle."""
+    p = ecdf_p_value(torch.full((20_000, 1), 99), 99)
+    assert 0 <= float(p) < 1e-9
+
+
+def test_bonferroni():
+    assert bonferroni(torch.tensor([0.2, 0.01, 0.5])) == pytest.approx(0.03)
+    assert bonferroni(torch.tensor([0.9, 0.8])) == 1.0
+
+
+# The loop against one inference on all windows, and on vehicles that change.
+def fleet(count: int) -> torch.Tensor:
+    """Vehicles with well resolved windows: ``log(T_L, K_L, sigma)``."""
+    share = torch.linspace(0, 1, count, dtype=F64)
+    return torch.stack([0.3 + 0.7 * share, 1.0 - 0.4 * share, 0.1 + 0.0 * share], -1).log()
+
+
+def test_sums_of_windows_are_sums_of_all_rows(fresh_seed):
+    g = torch.Generator().manual_seed(fresh_seed)
+    z = fleet(3)
+    rows = [
+        (*simulate_windows(z, u, generator=g), u) for u in (sine_commands(3, 50, 1.0, generator=g) for _ in range(4))
+    ]
+    parts = [JerkStatistics.from_samples(a, u, jerk) for a, jerk, u in rows]
+    a, jerk, u = (torch.cat(column, -1) for column in zip(*rows, strict=True))
+    whole = JerkStatistics.from_samples(a, u, jerk)
+    for name in ("n", "jj", "aj", "uj", "aa", "au", "uu"):
+        assert torch.allclose(getattr(pool(parts), name), getattr(whole, name), rtol=1e-10)
+
+
+@pytest.mark.parametrize("amplitude", [1.0, 0.2])
+def test_one_window_with_a_sigma_of_its_own_is_that_window(amplitude, fresh_seed):
+    """With one window both are the same posterior: that of the vehicle with sigma integrated out."""
+    g = torch.Generator().manual_seed(fresh_seed)
+    (seen,) = windows_of(constant(fleet(4), 1), amplitude=amplitude, generator=g)
+    free, whole = integrate(FreeNoise([seen])), integrate(JerkDensity(seen))
+    assert torch.allclose(free.log_evidence, whole.log_evidence, atol=1e-5)
+    assert ((free.mean - whole.mean[:, :2]) / free.sd).abs().max() < 1e-4
+    assert torch.allclose(free.sd, whole.sd[:, :2], rtol=1e-4)
+
+
+def test_selected_vehicles_keep_their_density(fresh_seed):
+    g = torch.Generator().manual_seed(fresh_seed)
+    density = FreeNoise(windows_of(constant(fleet(3), 2), generator=g))
+    z = fleet(3)[:, :2]
+    index = torch.tensor([2, 0])
+    assert density.select(index).log_prob(z[index]).equal(density.log_prob(z)[index])
+    assert density.constrain(z).equal(z.exp())
+
+
+@pytest.mark.statistical
+def test_posterior_mode_ends_where_the_pooled_posterior_is(rotating_seed):
+    """Four well excited windows.
+
+    Each step carries on the moments of at least a thousand effective draws, an error of 1/sqrt(1000) SD in the mean:
+    after four steps 5 sigma are 0.32 SD, and in the SD of the last step 0.11. The normal itself errs by the skewness of
+    a well excited window's posterior, which is of order SD/T, below 0.1.
+    """
+    g = torch.Generator().manual_seed(rotating_seed)
+    path = constant(fleet(10), 4)
+    seen = windows_of(path, generator=g)
+    pooled = truth_given_all(seen)
+    found = PooledComparison.of(track_loop(path, seen, mode="posterior", seed=rotating_seed), pooled)
+    assert pooled.converged.all()
+    assert found.shift.abs().max() < 0.32 + 0.1
+    assert (found.sd_ratio - 1).abs().max() < 0.11 + 0.1
+    # lambda I forgets all but the last of four windows: twice the SD, within what windows of other phases differ
+    loose = PooledComparison.of(track_loop(path, seen, mode="lambda", seed=rotating_seed), pooled)
+    assert 1.5 < loose.sd_ratio[:, :2].median() < 2.8
+
+
+@pytest.mark.statistical
+def test_a_sigma_of_its_own_for_every_window_costs_little(rotating_seed):
+    """Where all windows have the same sigma, letting it vary loses of order one part in 2 n of the information."""
+    g = torch.Generator().manual_seed(rotating_seed)
+    seen = windows_of(constant(fleet(5), 3), generator=g)
+    shared, free = truth_given_all(seen), truth_given_all(seen, shared_noise=False)
+    assert free.names == ("T_L", "K_L")
+    assert ((free.sd / shared.sd[:, :2]) - 1).abs().max() < 0.15
+
+
+def test_paths():
+    z, later = fleet(2), fleet(2) + 1
+    stays, steps = constant(z, 4), step(z, later, 4, at=3)
+    assert stays.shape == (4, 2, 3)
+    assert steps[2].equal(z)
+    assert steps[3, :, :2].equal(later[:, :2])
+    assert steps[3, :, 2].equal(z[:, 2])
+    rate = torch.tensor([[0.1, -0.1]], dtype=F64).expand(2, 2)
+    drifts = drift(z, rate, 4)
+    assert torch.allclose(drifts[3] - z, torch.tensor([0.3, -0.3, 0.0], dtype=F64).expand(2, 3))
+
+
+@pytest.mark.statistical
+def test_lambda_follows_a_step_that_posterior_mode_does_not(rotating_seed):
+    g = torch.Generator().manual_seed(rotating_seed)
+    z = torch.tensor([[0.3, 1.0, 0.1]], dtype=F64).log().expand(10, -1)
+    later = torch.tensor([[1.0, 0.6, 0.1]], dtype=F64).log().expand(10, -1)
+    path = step(z, later, 4, at=3)
+    seen = windows_of(path, generator=g)
+    follows, stays = (track_loop(path, seen, mode=mode, seed=rotating_seed) for mode in ("lambda", "posterior"))
+    assert follows.covered.shape == (4, 10, 3)
+    # an SD of about 3 %; posterior mode is between three windows at 0.3 s and one at 1 s
+    assert follows.relative_error[-1, :, 0].median() < 0.2
+    assert stays.relative_error[-1, :, 0].median() > 0.3
+    assert math.isclose(float(follows.truth[-1, 0, 0]), 1.0)
+
+
 @pytest.mark.parametrize(
     ("call", "name"),
     [
@@ -181,15 +387,15 @@ def test_a_prior_that_claims_too_much_is_seen(rotating_seed):
         (lambda: sbc_loop(10, truth="drawn"), "truth"),
         (lambda: sbc_loop(10, mode="all"), "mode"),
         (lambda: simulate_windows(torch.zeros(3, 2), torch.zeros(3, 5)), "z, u"),
+        (lambda: ecdf_band(10, 9, level=1.0), "level"),
+        (lambda: ecdf_band(0, 9), "replications, draws"),
+        (lambda: chi2_p_value(torch.zeros(5, 1, dtype=torch.long), 10), "bins"),
+        (lambda: ecdf_p_value(torch.full((5, 1), 10), 9), "ranks"),
+        (lambda: ecdf_p_value(torch.zeros(5, dtype=torch.long), 9), "ranks"),
+        (lambda: pool([]), "windows"),
+        (lambda: track_loop(constant(fleet(2), 3), windows_of(constant(fleet(2), 2)), mode="lambda"), "path, windows"),
     ],
 )
 def test_bad_arguments_are_refused_by_name(call, name):
     with pytest.raises(InputError, match=rf"^{name}: "):
         call()
-
-
-def test_statistics_are_those_of_the_samples():
-    z = torch.tensor([[0.3, 1.0, 0.5]], dtype=F64).log()
-    one, other = (statistics(z, rows=50, generator=torch.Generator().manual_seed(1)) for _ in range(2))
-    assert one.jj.equal(other.jj)
-    assert one.n.tolist() == [50]

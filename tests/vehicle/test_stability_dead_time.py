@@ -76,38 +76,14 @@ def test_reference_values():
 def test_nyquist_count_against_the_roots(fresh_seed):
     T, K, tau, gains, theta = random_delayed(600, fresh_seed)
     theta = theta.clamp_min(0.01)
+    # some that only a delay could unsettle or settle: without it k_a > 1/K makes them unstable
+    gains[:100, 2] += 1.5
     got = stability.local_stable(T, K, tau, gains, dead_time=theta)
     rows = zip(T.tolist(), K.tolist(), tau.tolist(), gains.tolist(), theta.tolist(), strict=True)
     roots = torch.tensor([rightmost_root(*row) for row in rows])
     clear = roots.abs() > 1e-6
     assert 100 < got.sum() < 500
     assert torch.equal(got[clear], (roots < 0)[clear])
-
-
-def test_nyquist_count_against_the_argument_of_the_characteristic(fresh_seed):
-    """Mikhailov: stable iff arg F(j omega) of F = T s^3 + s^2 + K E q turns by 3 pi / 2 from omega = 0 to infinity."""
-    T, K, tau, gains, theta = random_delayed(2000, fresh_seed)
-    # Some that only a delay could unsettle or settle: without it k_a > 1/K makes them unstable.
-    gains[:400, 2] = gains[:400, 2] + 1.5
-    got = stability.local_stable(T, K, tau, gains, dead_time=theta)
-    ks, kv, ka = (x[:, None] for x in gains.unbind(-1))
-    turned = torch.zeros_like(T)
-    closest = torch.full_like(T, torch.inf)
-    last = None
-    omega = torch.cat((torch.zeros(1), torch.logspace(-3, 3, 3000))).double()
-    for w in omega.split(50):
-        s = 1j * w
-        q = -ka * s**2 + (ks * tau[:, None] + kv) * s + ks
-        F = T[:, None] * s**3 + s**2 + K[:, None] * torch.exp(-s * theta[:, None]) * q
-        closest = torch.minimum(closest, (F.abs() / (1 + w**3)).amin(-1))
-        F = F if last is None else torch.cat((last, F), -1)
-        step = (F[:, 1:] / F[:, :-1]).angle()
-        turned = turned + step.sum(-1)
-        last = F[:, -1:]
-    stable = turned > 1.25 * math.pi
-    clear = closest > 1e-3
-    assert clear.double().mean() > 0.9
-    assert torch.equal(got[clear], stable[clear])
 
 
 def test_peak_gain_against_a_finer_sweep(fresh_seed):

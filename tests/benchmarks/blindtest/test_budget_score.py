@@ -9,7 +9,7 @@ import pytest
 from avtorch.errors import InputError
 from benchmarks.blindtest import budget_score as of
 from benchmarks.blindtest.ambiguity import utility
-from benchmarks.blindtest.answers import Answered, read_answer
+from benchmarks.blindtest.answers import read_answer
 from benchmarks.blindtest.score import score
 from tests.benchmarks.blindtest.test_score import answer, perfect, truths
 
@@ -257,13 +257,3 @@ def broken(change: dict[str, Any]) -> dict[str, Any]:
 def test_broken_budgets_are_named(said: dict, told: str) -> None:
     with pytest.raises(InputError, match=told):
         read_answer(several(), said)
-
-
-def test_all_fields_of_an_answer_are_read() -> None:
-    one = read_answer(several(), divided(SHARES, chance=("gust",)))
-    assert isinstance(one, Answered)
-    assert one.budget is not None
-    assert [part.name for part in one.budget.parts] == list(SHARES)
-    assert [part.name for part in one.budget.chance] == ["gust"]
-    assert one.budget.part("gust") is one.budget.chance[0]
-    assert one.budget.part("backlash") is None
