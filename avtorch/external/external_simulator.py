@@ -169,7 +169,7 @@ class SimulatorBesideCar:
     def logs(self) -> tuple[Log, ...]:
         """The car's, less what the simulator does beyond its surrogate."""
         cars = [replace(log, engaged=out.engaged) for log, out in zip(self.cars, self.outputs, strict=True)]
-        return tuple(without_discrepancy(log, out, self.plant) for log, out in zip(cars, self.outputs, strict=True))
+        return tuple(less(log, out, discrepancy(out, self.plant)) for log, out in zip(cars, self.outputs, strict=True))
 
     @property
     def plant(self) -> GapPlant:
@@ -185,7 +185,10 @@ class SimulatorBesideCar:
         missing = set(out.tested.missing)
         rest = [effect for effect in found.plant.effects if effect.name not in missing]
         bare = GapPlant(rest, T_L=found.plant.T_L, K_L=found.plant.K_L, sigma=0.0)
-        cars = [_without(*each, found.plant, bare) for each in zip(self.cars, self.outputs, strict=True)]
+        cars = []
+        for log, out in zip(self.cars, self.outputs, strict=True):
+            whole, without = responses(out, found.plant), responses(out, bare)
+            cars.append(less(log, out, {name: values - without[name] for name, values in whole.items()}))
         fitted = adjusted(self.fitted.rollouts, self.simulator.adjustable, logs=cars)
         again = replace(self, outputs=fitted.outputs, surrogate=surrogate_of(fitted.outputs), fitted=fitted)
         return again._told(found)
@@ -224,12 +227,6 @@ class SimulatorBesideCar:
         return replace(found, tested=facts, notes=(*found.notes, *getattr(self.simulator.of, "notes", ())))
 
 
-def _without(log: Log, drives: Log, car: GapPlant, bare: GapPlant) -> Log:
-    """The car's log less what it does beyond a `bare` one."""
-    whole, less = responses(drives, car), responses(drives, bare)
-    return replace(log, **{n: getattr(log, n) - whole[n] + less[n] for n in whole if getattr(log, n) is not None})
-
-
 def responses(drives: Log, plant: GapPlant) -> dict[str, FloatArray]:
     """What `plant` does in `drives` by the channels that these have, (time,): acceleration [m/s²] and speed [m/s], anew
     from each segment's first row. Rows under the driver keep what is there."""
@@ -254,16 +251,15 @@ def discrepancy(simulated: Log, surrogate: GapPlant) -> dict[str, FloatArray]:
     return {name: getattr(simulated, name) - values for name, values in responses(simulated, surrogate).items()}
 
 
-def without_discrepancy(log: Log, simulated: Log, surrogate: GapPlant) -> Log:
-    """The car's `log` less what the simulator does beyond its surrogate, row by row.
+def less(log: Log, simulated: Log, beyond: Mapping[str, FloatArray]) -> Log:
+    """The car's `log` less what is `beyond`, row by row, in the channels that the output `simulated` has, too.
 
-    Raises `InputError` where the simulator's output lacks a channel of the log.
+    Raises `InputError` where it has none of the log's.
     """
-    known = discrepancy(simulated, surrogate)
     channels = {name: getattr(log, name) for name in ("accel", "speed") if getattr(log, name) is not None}
-    shared = {name: values - known[name] for name, values in channels.items() if name in known}
+    shared = {name: values - beyond[name] for name, values in channels.items() if name in beyond}
     if not shared:
-        raise InputError(f"{simulated.name}: found {' and '.join(known)}, needs {' or '.join(channels)} as {log.name}")
+        raise InputError(f"{simulated.name}: found {' and '.join(beyond)}, needs {' or '.join(channels)} as {log.name}")
     return replace(log, **{name: shared.get(name) for name in channels})
 
 
