@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import PermutationMethod, pearsonr, rankdata
@@ -55,7 +56,7 @@ def rank_agreement(
             raise InputError(f"{side}: found scores {x.tolist()}, needs finite ones that are not all equal")
     a, b = (-a, -b) if higher_is_better else (a, b)
     orders = PermutationMethod(n_resamples=_ORDERS, rng=0)
-    found = pearsonr(rankdata(a), rankdata(b), alternative="greater", method=orders)
+    found: Any = pearsonr(rankdata(a), rankdata(b), alternative="greater", method=orders)
     chosen, best = int(a.argmin()), int(b.argmin())
     return RankAgreement(
         srcc=round(float(found.statistic), 12),

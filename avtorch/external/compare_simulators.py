@@ -229,7 +229,7 @@ def differences(
     chains = [surrogate.plant for surrogate in surrogates]
     base, donor = chains[far], chains[1 - far]
     own = rows.rolled_out(base)
-    each = [{"T_L": {"T_L": float(s.plant.T_L)}, "K_L": {"K_L": float(s.plant.K_L)}} | s.sizes() for s in surrogates]
+    each = [{key: {key: x} for key, x in s.lag_and_gain.items()} | s.sizes() for s in surrogates]
     sides = {name: [values.get(name) for values in each] for name in _parts(chains)}
     apart = [name for name, (one, two) in sides.items() if not _alike(one, two)]
     known: dict[frozenset[str], FloatArray] = {}

@@ -341,7 +341,10 @@ class _Process:
             more = "" if timeout_s == OPENING_S else "; a longer timeout_s gives it more"
             what = f"it does not answer within {timeout_s:g} s{more}"
         except ValueError:
-            what = f"it ended the process that ran it ({_ending(self._child)})"
+            self.end()
+            code = -self._child.returncode
+            how = signal.Signals(code).name if code in signal.valid_signals() else f"status {-code}"
+            what = f"it ended the process that ran it ({how})"
         else:
             if "refused" in answer:
                 raise InputError(f"{self.source}: {answer['refused']}")
@@ -360,25 +363,12 @@ def _forward(stream: IO[bytes], lines: queue.SimpleQueue[bytes]) -> None:
     lines.put(b"")
 
 
-def _ending(process: subprocess.Popen[bytes]) -> str:
-    """How a process ended, in words."""
-    _kill(process)
-    code = process.wait()
-    if code >= 0:
-        return f"status {code}"
-    return signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
-
-
-def _kill(process: subprocess.Popen[bytes]) -> None:
+def _end(process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[str]) -> None:
     with suppress(OSError):
         if hasattr(os, "killpg") and process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
         else:  # Windows has no groups to end
             process.kill()
-
-
-def _end(process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[str]) -> None:
-    _kill(process)
     process.wait()
     for stream in (process.stdin, process.stdout):
         if stream is not None:

@@ -24,7 +24,7 @@ from avtorch.decision.grid import GAINS_GRID, Grid
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.gap import GapPlant
-from avtorch.gap.linearised import linearised as linearised
+from avtorch.gap.linearised import linearised
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.effect_response import is_linear, is_one_sided
 from avtorch.vehicle.stability import Chain, chain_verdict
