@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from scipy.integrate import cumulative_trapezoid
 from scipy.special import logsumexp
 from torch.distributions import LowRankMultivariateNormal
 
@@ -132,9 +133,7 @@ class ManoeuvrePrediction:
         own = next(e for e in self.contender.plant.effects if isinstance(e, RoadGrade))
         road = own.prepared(drive.time, drive.speed, drive.position)
         force = size * road.columns(drive.position).numpy().T
-        step = float(m.time[1] - m.time[0])
-        gained = np.cumsum(0.5 * step * (force[:, 1:] + force[:, :-1]), -1)
-        speed = np.concatenate([np.zeros((len(force), 1)), gained], -1)
+        speed = cumulative_trapezoid(force, m.time, initial=0.0)
         accel = np.zeros_like(force) if self.contender.specific_force else force
         return self.coefficients(np.stack([{"accel": accel, "speed": speed}[name] for name in self.channels], 1))
 
