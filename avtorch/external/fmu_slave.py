@@ -110,8 +110,10 @@ class AvtorchBlock(Fmi2Slave):
         """Take the parameters as they are now."""
         plant = self._plant.with_values({k: torch.tensor(self._values[k], dtype=torch.float64) for k in self._own})
         self._run = GapPlant(plant.effects, T_L=plant.T_L, K_L=plant.K_L, sigma=plant.sigma, seed=self._values["seed"])
-        self._around = None if self._dt is None else Around(self._run, self._dt)
-        self._car = self._started()
+        if self._dt is None:
+            self._car = self._started()
+        else:
+            self._around = Around(self._run, self._dt)
 
     def do_step(self, current_time: float, step_size: float) -> bool:
         """Go on to the next communication point."""
@@ -120,12 +122,8 @@ class AvtorchBlock(Fmi2Slave):
                 raise ValueError(f"step size: found {step_size!r} s, needs {self._dt!r} s")
             self._outside().advance(*self._inputs())
             return True
-        accel, speed = self._started()
-        command, none = (
-            torch.tensor(self._values["accel_cmd"], dtype=torch.float64),
-            torch.zeros((), dtype=torch.float64),
-        )
-        accel, speed, _ = self._run.step(accel, speed, command, step_size, none)
+        command = torch.tensor(self._values["accel_cmd"], dtype=torch.float64)
+        accel, speed, _ = self._run.step(*self._started(), command, step_size, torch.zeros_like(command))
         self._car = accel, speed.clamp_min(0.0)  # a car does not roll back
         return True
 
