@@ -116,7 +116,7 @@ def next_experiment(
     step, of = called(progress), len(rivals) + len(offers)
     predictions, expected = [], []
     for rival in rivals:
-        predictions.append(ManoeuvrePrediction.of(rival, offers, channels, group, _DRAWS))
+        predictions.append(ManoeuvrePrediction(rival, offers, channels, group, _DRAWS))
         if step is not None:
             step(len(predictions), of)
     for i in range(len(offers)):
@@ -150,9 +150,8 @@ def write_table(experiment: Experiment | None, folder: str | PathLike[str]) -> l
         return []
     m = experiment.manoeuvre
     with atomic(path) as stream:
-        stream.write("time,accel_cmd,speed_expected\n")
-        rows = zip(m.time, m.command, m.speed, strict=True)
-        stream.writelines(f"{t:.6g},{u:.6g},{v:.6g}\n" for t, u, v in rows)
+        header, rows = "time,accel_cmd,speed_expected", np.column_stack([m.time, m.command, m.speed])
+        np.savetxt(stream, rows, "%.6g", delimiter=",", header=header, comments="")
     return [path]
 
 

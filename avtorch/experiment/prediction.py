@@ -14,7 +14,9 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from scipy.integrate import cumulative_trapezoid
 from scipy.special import logsumexp
+from torch.distributions import LowRankMultivariateNormal
 
 from avtorch.arrays import FloatArray
 from avtorch.experiment.manoeuvres import Manoeuvre
@@ -53,49 +55,38 @@ class PredictiveLaw:
 
     def log_density(self, measured: FloatArray) -> FloatArray:
         """Log density of coefficients (draw, channel, frame, bin): (draw,) [nats]."""
-        e, u = self.whitened(measured - self.mean), self.whitened(self.spread)
+        errors, spread = (torch.as_tensor(self.whitened(x)) for x in (measured - self.mean, self.spread))
+        law = LowRankMultivariateNormal(torch.zeros_like(spread[0]), spread.T, torch.ones_like(spread[0]))
         frames = self.mean.shape[1]
         scale = frames * float(np.log(np.einsum("kcc->kc", self.root)).sum())
-        constant = -scale - 0.5 * self.mean.size * float(np.log(2 * np.pi))
-        gram = np.eye(len(u)) + u @ u.T
-        match = e @ u.T
-        taken = np.linalg.solve(gram, match.T).T
-        size = float(np.linalg.slogdet(gram)[1])
-        return constant - 0.5 * ((e**2).sum(-1) - (match * taken).sum(-1) + size)
+        return law.log_prob(errors).numpy() - scale
 
     def whitened(self, errors: FloatArray) -> FloatArray:
         """Errors (column, channel, frame, bin) in units of the noise: (column, coefficient)."""
         return np.einsum("kcd,ndfk->ncfk", np.linalg.inv(self.root), errors).reshape(len(errors), -1)
 
 
-@dataclass(frozen=True, eq=False)
 class ManoeuvrePrediction:
-    """One contender on all manoeuvres: `rollouts` (manoeuvre, draw, channel, row), half of which make the laws and
-    half the examples.
+    """One `contender` on all `manoeuvres`, simulated with so many `draws` of its belief: `rollouts` (manoeuvre, draw,
+    channel, row), half of which make the laws and half the examples.
+
+    Rows of the manoeuvres are means of `group` rows of a log that has these `channels`.
     """
 
-    contender: PredictiveModel
-    channels: tuple[str, ...]
-    manoeuvres: Sequence[Manoeuvre] = field(repr=False)
-    rollouts: FloatArray = field(repr=False)
-    group: int
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         contender: PredictiveModel,
         manoeuvres: Sequence[Manoeuvre],
         channels: tuple[str, ...],
         group: int,
         draws: int,
-    ) -> ManoeuvrePrediction:
-        """Simulate with this many `draws`; rows of the manoeuvres are means of `group` rows of a log."""
+    ) -> None:
+        self.contender, self.manoeuvres, self.channels, self.group = contender, manoeuvres, channels, group
         seen = responses(contender, manoeuvres, slice(0, draws))
         # parts that do not depend on the draw come without that dimension
         shape = (len(manoeuvres), draws, len(manoeuvres[0].time))
         parts = {"accel": seen.accel_measured, "speed": seen.speed_measured}
-        stacked = torch.stack([parts[name].expand(shape) for name in channels], -2).numpy()
-        return cls(contender, channels, manoeuvres, stacked, group)
+        self.rollouts: FloatArray = torch.stack([parts[name].expand(shape) for name in channels], -2).numpy()
 
     def law(self, number: int) -> PredictiveLaw:
         """The prediction for manoeuvre `number`."""
@@ -142,9 +133,7 @@ class ManoeuvrePrediction:
         own = next(e for e in self.contender.plant.effects if isinstance(e, RoadGrade))
         road = own.prepared(drive.time, drive.speed, drive.position)
         force = size * road.columns(drive.position).numpy().T
-        step = float(m.time[1] - m.time[0])
-        gained = np.cumsum(0.5 * step * (force[:, 1:] + force[:, :-1]), -1)
-        speed = np.concatenate([np.zeros((len(force), 1)), gained], -1)
+        speed = cumulative_trapezoid(force, m.time, initial=0.0)
         accel = np.zeros_like(force) if self.contender.specific_force else force
         return self.coefficients(np.stack([{"accel": accel, "speed": speed}[name] for name in self.channels], 1))
 

@@ -162,17 +162,6 @@ _STAYS = 0.02  # prior standard deviations, a hundredth of the range
 _SURELY = 0.95  # of an interval that does not hold the present value
 
 
-@dataclass(frozen=True, eq=False)
-class Adjusted:
-    """`parameters`: what the simulator has, and what the car has; they differ where the evidence says that other values
-    are needed. `outputs`: the simulator's by drive, with the car's values where they differ. `rollouts`: those made.
-    """
-
-    outputs: tuple[Log, ...]
-    parameters: tuple[ParameterDifference, ...]
-    rollouts: Rollouts
-
-
 @dataclass(eq=False)
 class Rollouts:
     """A simulator under the commands of the car's drives `logs`, by the values of its parameters; from `start` on.
@@ -210,8 +199,12 @@ def fewest_rollouts(limits: Limits) -> int:
     return len(limits) + 3
 
 
-def adjusted(rollouts: Rollouts, limits: Limits, *, logs: Sequence[Log] | None = None) -> Adjusted:
-    """The parameters named in `limits` fitted to the car's drives.
+def adjusted(
+    rollouts: Rollouts, limits: Limits, *, logs: Sequence[Log] | None = None
+) -> tuple[tuple[Log, ...], tuple[ParameterDifference, ...]]:
+    """The parameters named in `limits` fitted to the car's drives: the simulator's outputs by drive, and each parameter
+    of it beside the car's. They differ where the evidence says that other values are needed; the outputs are with the
+    car's values then.
 
     `logs`: these drives less what else is known of the car; default: as they are. Rows in which the simulator stands,
     or the driver drives, do not count.
@@ -255,7 +248,7 @@ def adjusted(rollouts: Rollouts, limits: Limits, *, logs: Sequence[Log] | None =
     found = tuple(
         _difference(name, before[name], car[name], errors[name], data.frame_count - 1, needed) for name in limits
     )
-    return Adjusted(better if any(p.differs for p in found) else first, found, rollouts)
+    return better if any(p.differs for p in found) else first, found
 
 
 def _difference(name: str, before: float, value: float, sd: float, freedom: int, needed: bool) -> ParameterDifference:

@@ -21,7 +21,7 @@ it does to the logarithm of the error. So the factors of all differences multipl
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import factorial
 from os import PathLike, fspath
@@ -207,27 +207,12 @@ def log_root(squares: FloatArray) -> FloatArray:
     return 0.5 * np.append(np.log(squares.sum()), squares / squares.sum())
 
 
-@dataclass(frozen=True, eq=False)
-class ScoredBlocks:
-    """`blocks` of rows, free runs of `horizon_s` [s], by which simulators are scored."""
-
-    rows: CountedRows = field(repr=False)
-    blocks: tuple[slice, ...]
-    horizon_s: float
-
-    @classmethod
-    def of(cls, rows: CountedRows) -> ScoredBlocks:
-        """Those of drives. Raises `InputError` where they are less than five times 4 s."""
-        check_length(rows, "logs")
-        horizon, (blocks,) = whole_runs([rows])
-        return cls(rows, tuple(blocks), horizon)
-
-    def log_errors(self, errors: FloatArray) -> dict[str, FloatArray]:
-        """Logarithms of root mean squares by metric, (1 + block,) as `ratio_of` takes them, of a rollout's `errors`
-        (channel, counted, group)."""
-        rows = np.array([(b.stop - b.start) * self.rows.group for b in self.blocks], dtype=float)
-        squares = self.rows.squares(errors, self.blocks)
-        return {name: log_root(np.maximum(x, _LEAST**2 * rows)) - log_root(rows) for name, x in squares.items()}
+def log_errors(rows: CountedRows, blocks: Sequence[slice], errors: FloatArray) -> dict[str, FloatArray]:
+    """Logarithms of root mean squares by metric, (1 + block,) as `ratio_of` takes them, of a rollout's `errors`
+    (channel, counted, group) in free runs over the `blocks`."""
+    count = np.array([(b.stop - b.start) * rows.group for b in blocks], dtype=float)
+    squares = rows.squares(errors, blocks)
+    return {name: log_root(np.maximum(x, _LEAST**2 * count)) - log_root(count) for name, x in squares.items()}
 
 
 _SAME = 0.01  # relative difference of parameters that is none
@@ -235,7 +220,7 @@ _MOST = 6  # differences told one by one; those that do less alone are told toge
 
 
 def differences(
-    scored: ScoredBlocks, surrogates: Sequence[Surrogate], far: int, errors: FloatArray
+    rows: CountedRows, blocks: Sequence[slice], surrogates: Sequence[Surrogate], far: int, errors: FloatArray
 ) -> tuple[Difference, ...]:
     """What the `surrogates` of two simulators have differently, that which most brings number `far` nearer first.
 
@@ -243,8 +228,9 @@ def differences(
     """
     chains = [surrogate.plant for surrogate in surrogates]
     base, donor = chains[far], chains[1 - far]
-    own = scored.rows.rolled_out(base)
-    sides = {name: [_values(surrogate, name) for surrogate in surrogates] for name in _parts(chains)}
+    own = rows.rolled_out(base)
+    each = [{key: {key: x} for key, x in s.lag_and_gain.items()} | s.sizes() for s in surrogates]
+    sides = {name: [values.get(name) for values in each] for name in _parts(chains)}
     apart = [name for name, (one, two) in sides.items() if not _alike(one, two)]
     known: dict[frozenset[str], FloatArray] = {}
 
@@ -254,8 +240,8 @@ def differences(
             changed = base
             for name in sorted(names):
                 changed = _with_part(changed, donor, name)
-            moved = errors + own - scored.rows.rolled_out(changed) if names else errors
-            known[names] = np.mean([*scored.log_errors(moved).values()], 0)
+            moved = errors + own - rows.rolled_out(changed) if names else errors
+            known[names] = np.mean([*log_errors(rows, blocks, moved).values()], 0)
         return known[names]
 
     as_it_is = with_parts(frozenset())
@@ -266,7 +252,7 @@ def differences(
     found = []
     for name, own_parts in groups.items():
         others = [group for other, group in groups.items() if other != name]
-        log_ratio = np.zeros(1 + len(scored.blocks))
+        log_ratio = np.zeros(1 + len(blocks))
         for count in range(len(others) + 1):
             weight = factorial(count) * factorial(len(others) - count) / factorial(len(others) + 1)
             for chosen in combinations(others, count):
@@ -296,12 +282,6 @@ def _with_part(base: GapPlant, donor: GapPlant, name: str) -> GapPlant:
     kept = [e for e in base.effects if e.name != name]
     lag = donor if any(_shares_lag(e) for e in (*donor.effects, *base.effects) if e.name == name) else base
     return GapPlant([*kept, *given], T_L=lag.T_L, K_L=base.K_L, sigma=base.sigma)
-
-
-def _values(surrogate: Surrogate, name: str) -> dict[str, float] | None:
-    if name in ("T_L", "K_L"):
-        return {name: float(getattr(surrogate.plant, name))}
-    return surrogate.sizes().get(name)
 
 
 def _alike(one: dict[str, float] | None, two: dict[str, float] | None) -> bool:
@@ -355,24 +335,27 @@ def compare_simulators(
     """
     if not 0 < level < 1:
         raise InputError(f"level: found {level}, needs a number between 0 and 1")
-    each = as_logs(logs, map=map, unit=unit)
+    each, steps = as_logs(logs, map=map, unit=unit), called(progress)
     given = [_driven(x) for x in (first, second)]
-    steps = called(progress)
     rolled = [simulator.outputs(each, steps) for simulator, _ in given]
-    cars = _scored(each, [outputs for outputs, _ in rolled])
+    outputs = [own for own, _ in rolled]
+    cars = _scored(each, outputs)
     surrogates = [
-        surrogate_of(outputs, progress=steps) if own is None else Surrogate(own, {})
-        for (_, own), (outputs, _) in zip(given, rolled, strict=True)
+        surrogate_of(own, progress=steps) if chain is None else Surrogate(chain, {})
+        for (_, chain), own in zip(given, outputs, strict=True)
     ]
-    scored = ScoredBlocks.of(CountedRows.of(cars))
-    errors = [scored.rows.measured - scored.rows.of_logs(outputs) for outputs, _ in rolled]
-    one, two = (scored.log_errors(e) for e in errors)
+    rows = CountedRows.of(cars)
+    check_length(rows, "logs")
+    horizon, (blocks,) = whole_runs([rows])
+    errors = [rows.measured - rows.of_logs(own) for own in outputs]
+    one, two = (log_errors(rows, blocks, e) for e in errors)
     both = np.mean([two[metric] - one[metric] for metric in one], 0)
     far = 0 if both[0] < 0 else 1
-    told = [
-        _told(simulator, surrogate, offsets, is_plant=own is not None)
-        for (simulator, own), surrogate, (_, offsets) in zip(given, surrogates, rolled, strict=True)
-    ]
+    told = []
+    for (simulator, chain), (_, offsets), surrogate in zip(given, rolled, surrogates, strict=True):
+        source = "plant" if chain is not None else "simulator" if simulator.output is None else "output"
+        notes = tuple(getattr(simulator.of, "notes", ()))
+        told.append(ComparedSimulator(simulator.name, source, surrogate, offsets, notes))
     return SimulatorComparison(
         log=LogFacts.of(each),
         first=told[0],
@@ -385,9 +368,9 @@ def compare_simulators(
         p_first=1 - p_below(both, 1 / (1 - MATERIAL)),
         p_second=p_below(both, 1 - MATERIAL),
         level=level,
-        blocks=len(scored.blocks),
-        horizon_s=scored.horizon_s,
-        differences=differences(scored, surrogates, far, errors[far]),
+        blocks=len(blocks),
+        horizon_s=horizon,
+        differences=differences(rows, blocks, surrogates, far, errors[far]),
     )
 
 
@@ -417,10 +400,3 @@ def _scored(logs: Sequence[Log], rolled: Sequence[Sequence[Log]]) -> list[Log]:
         replace(log, engaged=log.engaged & one.engaged & two.engaged, **absent)
         for log, one, two in zip(logs, *rolled, strict=True)
     ]
-
-
-def _told(
-    simulator: ExternalSimulator, surrogate: Surrogate, offsets: tuple[float, ...], *, is_plant: bool
-) -> ComparedSimulator:
-    source = "plant" if is_plant else "simulator" if simulator.output is None else "output"
-    return ComparedSimulator(simulator.name, source, surrogate, offsets, tuple(getattr(simulator.of, "notes", ())))

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, TypeVar
 
@@ -95,11 +95,14 @@ def driven_along(
     return in_drives(replace(log, name=name, accel=accel, speed=speed), log)
 
 
+@dataclass
 class _Drive:
-    """One simulator, with what is said where it fails."""
+    """One simulator, with what is said where it fails; `again` begins the time that a call may take."""
 
-    def __init__(self, simulator: Simulator, name: str, step_s: float | None, again: Callable[[], None]) -> None:
-        self._simulator, self._name, self._step_s, self._again = simulator, name, step_s, again
+    simulator: Simulator
+    name: str
+    step_s: float | None
+    again: Callable[[], None]
 
     def along(self, log: Log, part: slice) -> tuple[FloatArray, FloatArray]:
         """Acceleration and speed (row,) in the rows of `part`."""
@@ -111,10 +114,10 @@ class _Drive:
             begin_accel = float(log.accel[part][:rows].mean())
         begin_speed = 0.0 if log.speed is None else max(float(log.speed[part][0]), 0.0)
         steps = np.diff(time)
-        if self._step_s is None and isinstance(self._simulator, WholeDrives):
-            later = np.stack(self._simulator.whole_drive(command[:-1], steps, speed=begin_speed, accel=begin_accel), -1)
+        if self.step_s is None and isinstance(self.simulator, WholeDrives):
+            later = np.stack(self.simulator.whole_drive(command[:-1], steps, speed=begin_speed, accel=begin_accel), -1)
         else:
-            self._called(float(time[0]), lambda: self._simulator.reset(speed=begin_speed, accel=begin_accel), "reset")
+            self._called(float(time[0]), lambda: self.simulator.reset(speed=begin_speed, accel=begin_accel), "reset")
             rows = zip(command[:-1], steps.tolist(), time.tolist(), strict=False)
             later = np.array([self._stepped(u, dt, stamp) for u, dt, stamp in rows])
         accel, speed = np.concatenate([[[begin_accel, begin_speed]], later]).T
@@ -123,25 +126,21 @@ class _Drive:
         return accel, speed
 
     def _stepped(self, u: float, dt: float, stamp: float) -> tuple[float, float]:
-        count, own = 1, dt
-        if self._step_s is not None:
-            count, own = max(1, round(dt / self._step_s)), self._step_s
-        answer: object = None
-        for _ in range(count):
-            answer = self._called(stamp, lambda: self._simulator.step(u, own), "step")
+        own = dt if self.step_s is None else self.step_s
+        answer: Any = None
+        for _ in range(max(1, round(dt / own))):
+            answer = self._called(stamp, lambda: self.simulator.step(u, own), "step")
         try:
-            accel, speed = answer  # type: ignore[misc]  # what a user's object returns is checked here
-            pair = float(accel), float(speed)
+            accel, speed = map(float, answer)
         except (TypeError, ValueError):
             raise self._fault(stamp, f"step returned {quoted(repr(answer))}, needs (accel, speed)") from None
-        if not (math.isfinite(pair[0]) and math.isfinite(pair[1])):
-            raise self._fault(
-                stamp, f"step returned {pair}, needs finite numbers; smaller steps may give them (--step {own / 5:g})"
-            )
-        return pair
+        if not (math.isfinite(accel) and math.isfinite(speed)):
+            told = f"step returned {(accel, speed)}, needs finite numbers; smaller steps may give them"
+            raise self._fault(stamp, f"{told} (--step {own / 5:g})")
+        return accel, speed
 
     def _called(self, stamp: float, call: Callable[[], object], what: str) -> object:
-        self._again()
+        self.again()
         try:
             return call()
         except _TooLongError as late:
@@ -152,7 +151,7 @@ class _Drive:
             raise self._fault(stamp, f"{what} raised {type(error).__name__}: {quoted(str(error))}") from error
 
     def _fault(self, stamp: float, what: str) -> InputError:
-        return InputError(f"{self._name}: at {stamp:.6g} s of the log {what}")
+        return InputError(f"{self.name}: at {stamp:.6g} s of the log {what}")
 
 
 class _TooLongError(BaseException):

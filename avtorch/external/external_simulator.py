@@ -22,7 +22,7 @@ import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
-from avtorch.external.adjusting import Adjusted, Rollouts, adjusted, fewest_rollouts
+from avtorch.external.adjusting import Rollouts, adjusted, fewest_rollouts
 from avtorch.external.driving import aligned, driven_along, in_drives, side_by_side
 from avtorch.external.simulator import DrivenPlant, Limits, Simulator, Values, check_methods, values_of, with_values
 from avtorch.external.surrogate import Surrogate, surrogate_of
@@ -109,11 +109,11 @@ class ExternalSimulator:
             outputs, offsets = self.outputs(logs, progress)
             surrogate = surrogate_of(outputs, progress=progress)
             return SimulatorBesideCar(self, logs, outputs, surrogate, offsets, rollout_errors(logs, outputs))
-        rollouts = self._rollouts(logs, progress)
-        fitted = adjusted(rollouts, self.adjustable)
+        rollouts, offsets = self._rollouts(logs, progress), (0.0,) * len(logs)
+        outputs, own = adjusted(rollouts, self.adjustable)
         errors = rollout_errors(logs, rollouts.at(rollouts.start))
-        surrogate = surrogate_of(fitted.outputs, progress=progress)
-        return SimulatorBesideCar(self, logs, fitted.outputs, surrogate, (0.0,) * len(logs), errors, fitted)
+        surrogate = surrogate_of(outputs, progress=progress)
+        return SimulatorBesideCar(self, logs, outputs, surrogate, offsets, errors, own, rollouts)
 
     def outputs(
         self, logs: Sequence[Log], progress: Progress | None = None
@@ -153,8 +153,8 @@ class ExternalSimulator:
 class SimulatorBesideCar:
     """A diagnosis against `simulator`: that of `logs` with `plant` as its baseline.
 
-    `cars`: the car's logs. `outputs`: the simulator's. `rollout`: its errors, before anything is fitted. `fitted`: its
-    own parameters fitted to the car, where it may adjust any.
+    `cars`: the car's logs. `outputs`: the simulator's. `rollout`: its errors, before anything is fitted. `own`: its own
+    parameters fitted to the car by `rollouts`, where it may adjust any.
     """
 
     simulator: ExternalSimulator
@@ -163,13 +163,14 @@ class SimulatorBesideCar:
     surrogate: Surrogate
     offsets: tuple[float, ...]
     rollout: dict[str, float]
-    fitted: Adjusted | None = None
+    own: tuple[ParameterDifference, ...] = ()
+    rollouts: Rollouts | None = None
 
     @property
     def logs(self) -> tuple[Log, ...]:
         """The car's, less what the simulator does beyond its surrogate."""
         cars = [replace(log, engaged=out.engaged) for log, out in zip(self.cars, self.outputs, strict=True)]
-        return tuple(without_discrepancy(log, out, self.plant) for log, out in zip(cars, self.outputs, strict=True))
+        return tuple(less(log, out, discrepancy(out, self.plant)) for log, out in zip(cars, self.outputs, strict=True))
 
     @property
     def plant(self) -> GapPlant:
@@ -179,24 +180,23 @@ class SimulatorBesideCar:
     def told(self, found: Diagnosis) -> Diagnosis:
         """The diagnosis, with what it says of the simulator."""
         out = self._told(found)
-        if self.fitted is None or out.tested is None or found.plant is None or not out.tested.missing:
+        if self.rollouts is None or out.tested is None or found.plant is None or not out.tested.missing:
             return out
         # without what is missing its parameters stood in for that
         missing = set(out.tested.missing)
         rest = [effect for effect in found.plant.effects if effect.name not in missing]
         bare = GapPlant(rest, T_L=found.plant.T_L, K_L=found.plant.K_L, sigma=0.0)
-        cars = [_without(*each, found.plant, bare) for each in zip(self.cars, self.outputs, strict=True)]
-        fitted = adjusted(self.fitted.rollouts, self.simulator.adjustable, logs=cars)
-        again = replace(self, outputs=fitted.outputs, surrogate=surrogate_of(fitted.outputs), fitted=fitted)
-        return again._told(found)
+        cars = []
+        for log, out in zip(self.cars, self.outputs, strict=True):
+            whole, without = responses(out, found.plant), responses(out, bare)
+            cars.append(less(log, out, {name: values - without[name] for name, values in whole.items()}))
+        outputs, own = adjusted(self.rollouts, self.simulator.adjustable, logs=cars)
+        return replace(self, outputs=outputs, surrogate=surrogate_of(outputs), own=own)._told(found)
 
     def _told(self, found: Diagnosis) -> Diagnosis:
-        chain, fitted = self.plant, self.fitted
+        chain = self.plant
         own = chain.report()
-        differences = [
-            *(() if fitted is None else fitted.parameters),
-            *lag_and_gain(self.logs, self.outputs, chain, found),
-        ]
+        differences = [*self.own, *lag_and_gain(self.logs, self.outputs, chain, found)]
         # what chance decides is in no rollout, and so in no simulator
         by_chance = set() if found.budget is None else {part.name for part in found.budget.chance}
         missing = [
@@ -219,15 +219,9 @@ class SimulatorBesideCar:
             self.rollout,
             tuple(differences),
             tuple(missing),
-            0 if fitted is None else len(fitted.rollouts),
+            0 if self.rollouts is None else len(self.rollouts),
         )
         return replace(found, tested=facts, notes=(*found.notes, *getattr(self.simulator.of, "notes", ())))
-
-
-def _without(log: Log, drives: Log, car: GapPlant, bare: GapPlant) -> Log:
-    """The car's log less what it does beyond a `bare` one."""
-    whole, less = responses(drives, car), responses(drives, bare)
-    return replace(log, **{n: getattr(log, n) - whole[n] + less[n] for n in whole if getattr(log, n) is not None})
 
 
 def responses(drives: Log, plant: GapPlant) -> dict[str, FloatArray]:
@@ -254,16 +248,15 @@ def discrepancy(simulated: Log, surrogate: GapPlant) -> dict[str, FloatArray]:
     return {name: getattr(simulated, name) - values for name, values in responses(simulated, surrogate).items()}
 
 
-def without_discrepancy(log: Log, simulated: Log, surrogate: GapPlant) -> Log:
-    """The car's `log` less what the simulator does beyond its surrogate, row by row.
+def less(log: Log, simulated: Log, beyond: Mapping[str, FloatArray]) -> Log:
+    """The car's `log` less what is `beyond`, row by row, in the channels that the output `simulated` has, too.
 
-    Raises `InputError` where the simulator's output lacks a channel of the log.
+    Raises `InputError` where it has none of the log's.
     """
-    known = discrepancy(simulated, surrogate)
     channels = {name: getattr(log, name) for name in ("accel", "speed") if getattr(log, name) is not None}
-    shared = {name: values - known[name] for name, values in channels.items() if name in known}
+    shared = {name: values - beyond[name] for name, values in channels.items() if name in beyond}
     if not shared:
-        raise InputError(f"{simulated.name}: found {' and '.join(known)}, needs {' or '.join(channels)} as {log.name}")
+        raise InputError(f"{simulated.name}: found {' and '.join(beyond)}, needs {' or '.join(channels)} as {log.name}")
     return replace(log, **{name: shared.get(name) for name in channels})
 
 
@@ -319,7 +312,7 @@ def lag_and_gain(
 
     limits = {name: (x / _FARTHEST, x * _FARTHEST) for name, x in before.items()}
     try:
-        fitted = adjusted(Rollouts(logs, before, drive, most=100), limits)
+        _, fitted = adjusted(Rollouts(logs, before, drive, most=100), limits)
     except InputError:  # a drive too short for blocks to be held out
         return []
     likely = {**found.baseline, **found.winner.moved}  # which have lag and gain only where these were fitted
@@ -327,7 +320,7 @@ def lag_and_gain(
     whole = {"T_L": lateness(surrogate, float(np.mean(speeds)) if speeds else 0.0), "K_L": before["K_L"]}
     return [
         replace(p, own=False, differs=p.differs and _noticed(p, likely.get(p.name, p.car).mean, whole[p.name]))
-        for p in fitted.parameters
+        for p in fitted
     ]
 
 

@@ -15,6 +15,7 @@ import threading
 import weakref
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from copy import copy
 from pathlib import Path
 from typing import IO, Any
 
@@ -24,7 +25,7 @@ from numpy.typing import ArrayLike
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.external import fmu_process
-from avtorch.external.fmu_variables import SIGNALS, STARTS, Variable, ports
+from avtorch.external.fmu_variables import REALS, SIGNALS, STARTS, Variable, ports
 from avtorch.io.mapping import mapping_beside
 from avtorch.io.opening import place, read_toml
 
@@ -86,12 +87,14 @@ class FmuSimulator:
         if not self.path.is_file():
             what = "is no regular file" if self.path.exists() else "no such file"
             raise InputError(f"{source}: {what}; an FMU is needed")
-        told = _told(self.path, mapping)
-        wanted = told[0] | _known("map", map, (*SIGNALS, *STARTS)), told[1] | _known("unit", unit, SIGNALS)
+        names, units = _told(self.path, mapping)
+        names |= _known("map", map, (*SIGNALS, *STARTS))
+        units |= _known("unit", unit, SIGNALS)
         self._process = _Process(self.path.absolute(), source, float(timeout_s))
         self._listing = self._process.begun()
+        self._variables = [Variable(**v) for v in self._listing["variables"]]
         try:
-            self._ports = ports(source, self._listing, *wanted)
+            self._ports = ports(source, self._variables, names, units)
         except InputError:
             self.close()
             raise
@@ -111,7 +114,7 @@ class FmuSimulator:
         notes += [port.note for port in self._ports.values()]
         notes += [f"{s}: cannot be set; a drive begins at the FMU's own" for s in STARTS if s not in self._ports]
         taken = {port.variable.name for port in self._ports.values()}
-        if rest := [v["name"] for v in listing["variables"] if v["causality"] == "input" and v["name"] not in taken]:
+        if rest := [v.name for v in self._variables if v.causality == "input" and v.name not in taken]:
             notes.append(f"inputs that keep their start values: {listed(rest)}")
         if h:
             notes.append(f"steps of {h:g} s" + (" or shorter" if listing["variable_step"] else ", no others"))
@@ -130,22 +133,27 @@ class FmuSimulator:
             if name not in known:
                 raise InputError(f"parameters: found {quoted(str(name))}, needs one of {listed(known) or 'none'}")
             v = known[name]
-            whole = v.type in ("Real", "Float64", "Float32") or float(value).is_integer()
+            whole = v.type in REALS or float(value).is_integer()
             least, most = (-math.inf if v.least is None else v.least), (math.inf if v.most is None else v.most)
             if not (math.isfinite(value) and whole and least <= value <= most):
                 right = f"{'a finite' if whole else 'a whole'} number from {least:g} to {most:g}"
                 raise InputError(f"{printable(name, 40)}: found {value!r}, needs {right}")
-        other = object.__new__(FmuSimulator)
-        other.__dict__.update(self.__dict__, _values={**self._values, **{k: float(x) for k, x in values.items()}})
-        other._drive, other._start_notes = None, ()
+        return self._copy(_values=self._values | {name: float(value) for name, value in values.items()})
+
+    def apart(self) -> FmuSimulator:
+        """The same FMU with the same parameters in another process, which `close` ends."""
+        return self._copy(_process=self._process.another())
+
+    def _copy(self, **changed: Any) -> FmuSimulator:
+        other = copy(self)
+        other.__dict__.update(changed, _drive=None, _start_notes=())
         return other
 
     def _settable(self) -> dict[str, Variable]:
         starts = {self._ports[s].variable.name for s in STARTS if s in self._ports}
-        all_ = [Variable(**v) for v in self._listing["variables"]]
         return {
             v.name: v
-            for v in all_
+            for v in self._variables
             if v.causality == "parameter" and v.settable and v.start is not None and v.name not in starts
             and v.type.lstrip("U").rstrip("0123456789") in ("Real", "Float", "Integer", "Int")
         }  # fmt: skip
@@ -157,23 +165,23 @@ class FmuSimulator:
         for name, value in (("speed", speed), ("accel", accel)):
             if not math.isfinite(value):
                 raise InputError(f"{name}: found {value!r}, needs a finite number")
-        known, values = self._settable(), []
-        values += [(known[name].reference, known[name].type, value) for name, value in self._values.items()]
+        values, command = dict(self._values), self._ports["accel_cmd"]
         for name, value in (("speed0", speed), ("accel0", accel)):
             if name in self._ports:
-                values.append((*self._ports[name].where, value / self._ports[name].factor))
-        command, shown = self._ports["accel_cmd"], [self._ports[s] for s in ("accel", "speed")]
-        request = {
-            "values": values,
-            "command": command.where,
-            "at": accel / command.factor,
-            "outputs": [port.where for port in shown],
-        }
+                values[self._ports[name].variable.name] = value / self._ports[name].factor
+        outputs = [self._ports[s].variable.name for s in ("accel", "speed")]
+        request = {"values": values, "command": command.variable.name, "at": accel / command.factor, "outputs": outputs}
         self._process.begun()
         (begun,) = self._process.ask(request, OPENING_S)
         self._drive = self._process.drive = object()
-        self._step, self._time = None, 0.0
-        self._start_notes = _start_notes(zip(("accel", "speed"), begun["shown"], shown, (accel, speed), strict=True))
+        self._step, self._time, notes = None, 0.0, []
+        for name, unit, shown, asked in zip(
+            ("accel", "speed"), ("m/s²", "m/s"), begun["shown"], (accel, speed), strict=True
+        ):
+            at = shown * self._ports[name].factor
+            if not abs(at - asked) <= _OTHER_START:
+                notes.append(f"{name}: the FMU begins at {at:g} {unit}, the drive at {asked:g} {unit}")
+        self._start_notes = tuple(notes)
 
     def step(self, accel_cmd: float, dt: float) -> tuple[float, float]:
         """Hold the command [m/s²] for `dt` [s]; the acceleration [m/s²] and speed [m/s] at the end of it.
@@ -204,7 +212,7 @@ class FmuSimulator:
         return self._advance(command, steps)
 
     def _advance(self, command: FloatArray, dt: FloatArray) -> tuple[FloatArray, FloatArray]:
-        if self._drive is None or self._process.drive is not self._drive or not self._process.alive:
+        if self._drive is None or self._process.drive is not self._drive:
             raise InputError(f"{place(self.path)}: no drive is under way; needs reset first")
         if not np.isfinite(command).all():
             raise InputError(f"accel_cmd: found {command[~np.isfinite(command)][0]}, needs finite numbers")
@@ -244,12 +252,6 @@ class FmuSimulator:
         count = np.where(off, np.ceil(dt / h), count)
         return np.where(off, dt / count, h), count
 
-    def apart(self) -> FmuSimulator:
-        """The same FMU with the same parameters in another process, which `close` ends."""
-        other = object.__new__(FmuSimulator)
-        other.__dict__.update(self.__dict__, _process=self._process.another(), _drive=None, _start_notes=())
-        return other
-
     # its process ---------------------------------------------------------------------------------------------------
     def close(self) -> None:
         """End the process of the FMU; a later `reset` is refused."""
@@ -275,10 +277,6 @@ class _Process:
         self._listing: dict[str, Any] = {}
         self._finish: Any = None
 
-    @property
-    def alive(self) -> bool:
-        return self._finish is not None and self._finish.alive
-
     def another(self) -> _Process:
         return _Process(self._path, self.source, self.timeout_s)
 
@@ -289,6 +287,7 @@ class _Process:
 
     def end(self) -> None:
         """End it, and leave nothing of it."""
+        self.drive = None
         if self._finish is not None:
             self._finish()
 
@@ -296,22 +295,19 @@ class _Process:
         """What the FMU has, its process begun where none runs. Raises `InputError` where it cannot be opened."""
         if self._closed:
             raise InputError(f"{self.source}: is closed; needs FmuSimulator(...) again")
-        if self.alive:
+        if self._finish is not None and self._finish.alive:
             return self._listing
         folder = tempfile.TemporaryDirectory(prefix="avtorch_fmu_", ignore_cleanup_errors=True)
-        unpacked = Path(folder.name, "fmu")
-        unpacked.mkdir()
         # -P: nothing of the folder that the user happens to work in; a file, as its package would load PyTorch
         command = [sys.executable or "python", "-P", "-W", "ignore", fmu_process.__file__]
-        environment = dict(os.environ, PYTHONPATH=os.pathsep.join(part for part in sys.path if part))
         try:
             self._child = subprocess.Popen(
-                [*command, os.fspath(self._path), os.fspath(unpacked)],
+                [*command, os.fspath(self._path), os.path.join(folder.name, "fmu")],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 cwd=folder.name,  # where it may write what it likes
-                env=environment,
+                env=dict(os.environ, PYTHONPATH=os.pathsep.join(part for part in sys.path if part)),
                 start_new_session=True,  # with the tools that an FMU starts
             )
         except (OSError, ValueError) as fault:
@@ -345,7 +341,10 @@ class _Process:
             more = "" if timeout_s == OPENING_S else "; a longer timeout_s gives it more"
             what = f"it does not answer within {timeout_s:g} s{more}"
         except ValueError:
-            what = f"it ended the process that ran it ({_ending(self._child)})"
+            self.end()
+            code = -self._child.returncode
+            how = signal.Signals(code).name if code in signal.valid_signals() else f"status {-code}"
+            what = f"it ended the process that ran it ({how})"
         else:
             if "refused" in answer:
                 raise InputError(f"{self.source}: {answer['refused']}")
@@ -364,25 +363,12 @@ def _forward(stream: IO[bytes], lines: queue.SimpleQueue[bytes]) -> None:
     lines.put(b"")
 
 
-def _ending(process: subprocess.Popen[bytes]) -> str:
-    """How a process ended, in words."""
-    _kill(process)
-    code = process.wait()
-    if code >= 0:
-        return f"status {code}"
-    return signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
-
-
-def _kill(process: subprocess.Popen[bytes]) -> None:
+def _end(process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[str]) -> None:
     with suppress(OSError):
         if hasattr(os, "killpg") and process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
         else:  # Windows has no groups to end
             process.kill()
-
-
-def _end(process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[str]) -> None:
-    _kill(process)
     process.wait()
     for stream in (process.stdin, process.stdout):
         if stream is not None:
@@ -417,13 +403,3 @@ def _known(where: str, given: Mapping[str, Any] | None, signals: tuple[str, ...]
         if not isinstance(value, str):
             raise InputError(f"{where} {name}: is a {type(value).__name__}; a text is needed")
     return dict(given or {})
-
-
-def _start_notes(begun: Any) -> tuple[str, ...]:
-    si = {"accel": "m/s²", "speed": "m/s"}
-    notes = []
-    for name, value, port, asked in begun:
-        at = value * port.factor
-        if not abs(at - asked) <= _OTHER_START:
-            notes.append(f"{name}: the FMU begins at {at:g} {si[name]}, the drive at {asked:g} {si[name]}")
-    return tuple(notes)

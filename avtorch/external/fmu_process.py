@@ -21,13 +21,10 @@ NEED = "an FMU of FMI 2 or 3 with co-simulation"
 MOST_MEMORY = 32 * 2**30
 """Bytes of address space, where the system can limit it; the virtual machines of some tools reserve a lot."""
 
-_REALS = ("Real", "Float64", "Float32")
-Port = tuple[int, str]
-"""Reference and type of a variable."""
-
 
 class RunningFmu:
-    """An FMU of which one instance at a time runs. Raises `InputError` for what cannot be run here."""
+    """An FMU of which one instance at a time runs, unpacked in a new `folder`. Raises `InputError` for what cannot be
+    run here."""
 
     def __init__(self, path: str, folder: str) -> None:
         self._said, self._folder = "", folder
@@ -74,32 +71,32 @@ class RunningFmu:
             "variables": [_variable(v, units) for v in described.modelVariables if not v.shape],
         }
 
-    def begin(self, values: list[tuple[int, str, float]], command: Port, at: float, outputs: list[Port]) -> list[float]:
-        """Begin a drive with these start values and the command at `at`; what the outputs then show."""
+    def begin(self, values: dict[str, float], command: str, at: float, outputs: list[str]) -> list[float]:
+        """Begin a drive with these start values and the command at `at`; what the outputs then show. All by name."""
+        from fmpy.simulation import apply_start_values
+
         two = str(self._described.fmiVersion).startswith("2")
         self._said = ""
         if not self._fresh:
             (self._fmu.fmi2FreeInstance if two else self._fmu.fmi3FreeInstance)(self._fmu.component)
             self._fmu = self._instance()
         self._fresh = False
-        fmu = self._fmu
         if two:
-            fmu.setupExperiment(startTime=0.0)
-        for reference, type_, value in values:
-            getattr(fmu, f"set{type_}")([reference], [value if type_ in _REALS else int(value)])
-        fmu.enterInitializationMode()
-        self._command, self._outputs = command, outputs
+            self._fmu.setupExperiment(startTime=0.0)
+        apply_start_values(self._fmu, self._described, values)
+        self._fmu.enterInitializationMode()
+        known = {v.name: v for v in self._described.modelVariables}
+        self._command, self._outputs = known[command], [known[name] for name in outputs]
         self._send(at)
-        fmu.exitInitializationMode()
+        self._fmu.exitInitializationMode()
         self._time = 0.0
         return self._shown()
 
     def _send(self, command: float) -> None:
-        reference, type_ = self._command
-        getattr(self._fmu, f"set{type_}")([reference], [command])
+        getattr(self._fmu, f"set{self._command.type}")([self._command.valueReference], [command])
 
     def _shown(self) -> list[float]:
-        return [float(getattr(self._fmu, f"get{type_}")([reference])[0]) for reference, type_ in self._outputs]
+        return [float(getattr(self._fmu, f"get{v.type}")([v.valueReference])[0]) for v in self._outputs]
 
     def step(self, command: float, length: float, count: int) -> list[float]:
         """Hold the command over so many steps of a `length` [s]; the outputs at the end. Raises `InputError` where
@@ -131,7 +128,6 @@ def _variable(v: Any, units: dict[Any, Any]) -> dict[str, Any]:
     powers = {name: getattr(base, name) for name in ("kg", "m", "s", "A", "K", "mol", "cd", "rad")} if base else None
     return {
         "name": v.name,
-        "reference": v.valueReference,
         "type": v.type,
         "causality": v.causality,
         "settable": v.variability != "constant" and (v.initial == "exact" or v.causality == "input"),

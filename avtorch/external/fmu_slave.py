@@ -40,14 +40,11 @@ class AvtorchBlock(Fmi2Slave):
         block = json.loads((folder / "block.json").read_text(encoding="utf-8"))
         self._plant = GapPlant.from_toml((folder / "plant.toml").read_text(encoding="utf-8"))
         self._dt: float | None = block["dt"]
-        self.modelName = block["name"]
-        self.description = block["description"]
+        self.modelName, self.description = block["name"], block["description"]
         if self._dt is not None:
             self.default_experiment = DefaultExperiment(step_size=self._dt)
         self._units: dict[str, str] = {}
-        self._values: dict[str, float] = {}
-        self._seed = 0
-        self._cell = {"accel_cmd": 0.0, "accel_sim": 0.0, "speed_sim": 0.0, "speed0": 0.0, "accel0": 0.0}
+        self._values: dict[str, Any] = {}  # of inputs and parameters
         self._around: Around | None = None
         self._car: tuple[torch.Tensor, torch.Tensor] | None = None
         self._add("accel_cmd", "m/s2", "input")
@@ -62,35 +59,30 @@ class AvtorchBlock(Fmi2Slave):
             self._add("accel_cmd_out", "m/s2", "output", lambda: self._outside().command(*self._inputs()))
             self._add("accel", "m/s2", "output", lambda: self._outside().car(*self._inputs())[0])
             self._add("speed", "m/s", "output", lambda: self._outside().car(*self._inputs())[1])
-        self._add_parameters()
-
-    def _add(self, name: str, unit: str, causality: str, getter: Callable[[], float] | None = None) -> None:
-        self._units[name] = unit
-        fixed = {"variability": Fmi2Variability.fixed, "initial": Fmi2Initial.exact} if causality == "parameter" else {}
-        own = {"getter": getter} if getter is not None else self._reached(self._cell, name)
-        self.register_variable(Real(name, causality=getattr(Fmi2Causality, causality), **fixed, **own), nested=False)
-
-    @staticmethod
-    def _reached(cell: dict[str, float], name: str) -> dict[str, Callable]:
-        return {"getter": lambda: cell[name], "setter": lambda value: cell.__setitem__(name, value)}
-
-    def _add_parameters(self) -> None:
-        fixed = {"causality": Fmi2Causality.parameter, "variability": Fmi2Variability.fixed}
-        fixed["initial"] = Fmi2Initial.exact
         coordinates = self._plant.parameters()
-        for name, value in self._plant.values().items():
-            if value.numel() != 1 or (self._dt is not None and name in ("T_L", "K_L")):
-                continue
-            self._values[name] = float(value)
+        self._own = [
+            name
+            for name, value in self._plant.values().items()
+            if value.numel() == 1 and (self._dt is None or name not in ("T_L", "K_L"))
+        ]
+        for name in self._own:
             unit = coordinates[name].unit if name in coordinates else "-"
-            self._units[name] = unit.replace("²", "2").replace("³", "3")
-            self.register_variable(Real(name, **fixed, **self._reached(self._values, name)), nested=False)
+            unit = unit.replace("²", "2").replace("³", "3")
+            self._add(name, unit, "parameter", value=float(self._plant.values()[name]))
+        self._add("seed", "-", "parameter", value=0)
 
-        def seeded(value: int) -> None:
-            self._seed = value
-
-        seed = Integer("seed", getter=lambda: self._seed, setter=seeded, **fixed)
-        self.register_variable(seed, nested=False)
+    def _add(
+        self, name: str, unit: str, causality: str, getter: Callable[[], float] | None = None, value: float = 0.0
+    ) -> None:
+        self._units[name] = unit
+        more: dict[str, Any] = {"getter": getter}
+        if getter is None:
+            self._values[name] = value
+            more = {"getter": lambda: self._values[name], "setter": lambda x: self._values.__setitem__(name, x)}
+        if causality == "parameter":
+            more |= {"variability": Fmi2Variability.fixed, "initial": Fmi2Initial.exact}
+        kind = Integer if isinstance(value, int) else Real
+        self.register_variable(kind(name, causality=getattr(Fmi2Causality, causality), **more), nested=False)
 
     def to_xml(self, model_options: Any = ()) -> Element:
         """The model description, with what pythonfmu leaves out."""
@@ -102,7 +94,7 @@ class AvtorchBlock(Fmi2Slave):
         root.insert(1, definitions)
         for variable in root.iter("ScalarVariable"):
             name = variable.attrib["name"]
-            if name in self._values:
+            if name in self._own:
                 variable[0].set("start", repr(self._values[name]))  # 16 digits do not hold every number
             unit = self._units.get(name)
             if unit in _BASE:
@@ -116,10 +108,12 @@ class AvtorchBlock(Fmi2Slave):
     # drives --------------------------------------------------------------------------------------------------------
     def exit_initialization_mode(self) -> None:
         """Take the parameters as they are now."""
-        plant = self._plant.with_values({k: torch.tensor(x, dtype=torch.float64) for k, x in self._values.items()})
-        self._run = GapPlant(plant.effects, T_L=plant.T_L, K_L=plant.K_L, sigma=plant.sigma, seed=self._seed)
-        self._around = None if self._dt is None else Around(self._run, self._dt)
-        self._car = self._started()
+        plant = self._plant.with_values({k: torch.tensor(self._values[k], dtype=torch.float64) for k in self._own})
+        self._run = GapPlant(plant.effects, T_L=plant.T_L, K_L=plant.K_L, sigma=plant.sigma, seed=self._values["seed"])
+        if self._dt is None:
+            self._car = self._started()
+        else:
+            self._around = Around(self._run, self._dt)
 
     def do_step(self, current_time: float, step_size: float) -> bool:
         """Go on to the next communication point."""
@@ -128,19 +122,18 @@ class AvtorchBlock(Fmi2Slave):
                 raise ValueError(f"step size: found {step_size!r} s, needs {self._dt!r} s")
             self._outside().advance(*self._inputs())
             return True
-        accel, speed = self._started()
-        command, none = torch.tensor(self._cell["accel_cmd"], dtype=torch.float64), torch.zeros((), dtype=torch.float64)
-        accel, speed, _ = self._run.step(accel, speed, command, step_size, none)
+        command = torch.tensor(self._values["accel_cmd"], dtype=torch.float64)
+        accel, speed, _ = self._run.step(*self._started(), command, step_size, torch.zeros_like(command))
         self._car = accel, speed.clamp_min(0.0)  # a car does not roll back
         return True
 
     def _started(self) -> tuple[torch.Tensor, torch.Tensor]:
         if self._car is not None:
             return self._car
-        return tuple(torch.tensor(self._cell[name], dtype=torch.float64) for name in ("accel0", "speed0"))  # pyright: ignore[reportReturnType]
+        return tuple(torch.tensor(self._values[name], dtype=torch.float64) for name in ("accel0", "speed0"))  # pyright: ignore[reportReturnType]
 
     def _inputs(self) -> tuple[float, float, float]:
-        return self._cell["accel_cmd"], self._cell["accel_sim"], self._cell["speed_sim"]
+        return self._values["accel_cmd"], self._values["accel_sim"], self._values["speed_sim"]
 
     def _outside(self) -> Around:
         if self._around is None:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
 
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.mapping import PEDALS
-from avtorch.io.units import stated_unit, to_si
+from avtorch.io.units import factor, stated_unit
 from avtorch.logcheck.vocabulary import header_of, likeness
 
 SIGNALS = ("accel_cmd", "accel", "speed")
@@ -21,7 +18,7 @@ _CAUSALITY = {"accel_cmd": "an input", "accel": "an output", "speed": "an output
     STARTS, "a parameter that can be set"
 )
 _SI = {"accel": "m/s²", "speed": "m/s"}
-_REALS = ("Real", "Float64", "Float32")
+REALS = ("Real", "Float64", "Float32")
 _NO_UNIT = ("", "-", "1")
 
 
@@ -30,7 +27,6 @@ class Variable:
     """A scalar of an FMU, as its modelDescription.xml has it."""
 
     name: str
-    reference: int
     type: str
     causality: str
     settable: bool
@@ -51,19 +47,15 @@ class Port:
     factor: float
     note: str
 
-    @property
-    def where(self) -> tuple[int, str]:
-        return self.variable.reference, self.variable.type
-
 
 def ports(
-    source: str, listing: Mapping[str, Any], names: Mapping[str, str], units: Mapping[str, str]
+    source: str, variables: Sequence[Variable], names: Mapping[str, str], units: Mapping[str, str]
 ) -> dict[str, Port]:
     """The signals of an FMU, and the start values that it lets one set; `units` overrule what it states.
 
     Raises InputError for a signal that is not found or may be several variables, and for a unit of another quantity.
     """
-    variables = [Variable(**v) for v in listing["variables"] if v["type"] in _REALS]
+    variables = [v for v in variables if v.type in REALS]
     found: dict[str, Port] = {}
     for signal in (*SIGNALS, *STARTS):
         able = [v for v in variables if _fits(v, signal)]
@@ -134,10 +126,10 @@ def _port(source: str, signal: str, v: Variable, how: str, units: Mapping[str, s
     given = units.get(signal, units.get(signal.removesuffix("0")))
     head = f"{signal}: variable {quoted(v.name)} ({how})"
     if given is not None:
-        return Port(v, _factor(kind, given), f"{head}, in {printable(given, 20)} as given")
-    factor = _stated(v, kind)
-    if factor is not None:
-        return Port(v, factor, f"{head}, in {printable(v.unit or _SI[kind], 20)}")
+        return Port(v, factor(kind, given), f"{head}, in {printable(given, 20)} as given")
+    size = _stated(v, kind)
+    if size is not None:
+        return Port(v, size, f"{head}, in {printable(v.unit or _SI[kind], 20)}")
     if not _without_unit(v):
         raise InputError(
             f"{source}: {signal} is variable {quoted(v.name)} in {quoted(v.unit or '', 20)}; needs a variable in a "
@@ -145,7 +137,7 @@ def _port(source: str, signal: str, v: Variable, how: str, units: Mapping[str, s
         )
     unit = header_of(v.name).unit
     if unit is not None and stated_unit(kind, unit) is not None:
-        return Port(v, _factor(kind, unit), f"{head}, in {unit} by its name")
+        return Port(v, factor(kind, unit), f"{head}, in {unit} by its name")
     return Port(v, 1.0, f"{head}, which states no unit: taken as {_SI[kind]}")
 
 
@@ -160,8 +152,4 @@ def _stated(v: Variable, kind: str) -> float | None:
     text = "" if _without_unit(v) else v.unit or ""
     # FMI writes m.s-2
     unit = stated_unit(kind, text) or stated_unit(kind, text.replace(".", "").replace("*", ""))
-    return None if unit is None else _factor(kind, unit)
-
-
-def _factor(kind: str, unit: str) -> float:
-    return float(to_si(kind, unit)(np.ones(1))[0])
+    return None if unit is None else factor(kind, unit)

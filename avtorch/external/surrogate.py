@@ -135,10 +135,14 @@ class Surrogate:
             for name, values in self.plant.report().items()
         }
 
+    @property
+    def lag_and_gain(self) -> dict[str, float]:
+        """`T_L` [s] and `K_L`."""
+        return {"T_L": float(self.plant.T_L), "K_L": float(self.plant.K_L)}
+
     def to_dict(self) -> dict[str, Any]:
         """As in `comparison.json`."""
-        lag_and_gain = {"T_L": float(self.plant.T_L), "K_L": float(self.plant.K_L)}
-        return {"effects": self.sizes(), **lag_and_gain, "left": dict(self.left)}
+        return {"effects": self.sizes(), **self.lag_and_gain, "left": dict(self.left)}
 
 
 def surrogate_of(
@@ -257,8 +261,8 @@ class SimulatorCheck(Displayed):
     @property
     def values(self) -> dict[str, float]:
         """`T_L` [s], `K_L`, and `effect.parameter` of the effects it has."""
-        own = {"T_L": float(self.surrogate.plant.T_L), "K_L": float(self.surrogate.plant.K_L)}
-        return own | {f"{e}.{k}": x for e, values in self.surrogate.sizes().items() for k, x in values.items()}
+        effects = self.surrogate.sizes()
+        return self.surrogate.lag_and_gain | {f"{e}.{k}": x for e, values in effects.items() for k, x in values.items()}
 
     @property
     def left(self) -> float:

@@ -43,18 +43,24 @@ NEEDED = ("speed", "spacing", "lead_speed")
 _WIDER = 2.0  # a delay can be far shorter than is typical, down to none
 
 
-@dataclass(frozen=True, eq=False)
 class Followed:
     """`law`, and a plant with a dead time or without, over the speed of a log; `data`: the log in coefficients.
 
-    `seen`: the law's inputs (row,) in each stretch of `data`.
+    `seen`: the law's inputs (row,) in each stretch of `data`. Only the speed is a channel, as the acceleration of
+    public recordings is its derivative. Raises `InputError` for a log without speed, spacing and the leader's speed,
+    or without a stretch of following that is long enough.
     """
 
-    log: Log = field(repr=False)
-    law: HeadwayLaw
-    plant: GapPlant
-    data: DriveData = field(repr=False)
-    seen: tuple[FollowerMeasurements, ...] = field(repr=False)
+    def __init__(self, log: Log, law: HeadwayLaw, plant: GapPlant) -> None:
+        for name in NEEDED:
+            if getattr(log, name) is None:
+                raise InputError(f"{log.name}: has no {name}, which a follower needs (with {', '.join(NEEDED)})")
+        self.log, self.law, self.plant = log, law, plant
+        self.data = DriveData.of(replace(log, accel=None, accel_cmd=np.zeros(log.rows)))
+        rows = torch.as_tensor(self.data.source[:, None] + np.arange(self.data.group))
+        means = [x[rows].mean(1) for x in seen_in(log)]
+        bounds = pairwise(self.data.bounds.tolist())
+        self.seen = [FollowerMeasurements(*(x[i:j] for x in means)) for i, j in bounds]
 
     @cached_property
     def coordinates(self) -> dict[str, Parameter]:
@@ -97,20 +103,12 @@ class Followed:
 
     def on(self, log: Log) -> Followed:
         """The same law and plant over other rows."""
-        return _over(log, self.law, self.plant)
+        return Followed(log, self.law, self.plant)
 
 
 def followed(log: Log, law: HeadwayLaw, *, dead_time: bool = True) -> Followed:
-    """Make the response for a car-following log; `dead_time` False: the plant is the bare GLVD.
-
-    Only its speed is a channel, as the acceleration of public recordings is that speed's derivative. Raises
-    `InputError` for a log without speed, spacing and the leader's speed, or without a stretch of following that is long
-    enough.
-    """
-    for name in NEEDED:
-        if getattr(log, name) is None:
-            raise InputError(f"{log.name}: has no {name}, which a follower needs (with {', '.join(NEEDED)})")
-    return _over(log, law, plant([delay_effect()()] if dead_time else []))
+    """The response to a car-following log; `dead_time` False: the plant is the bare GLVD. Raises as `Followed`."""
+    return Followed(log, law, plant([delay_effect()()] if dead_time else []))
 
 
 def seen_in(log: Log) -> FollowerMeasurements:
@@ -131,14 +129,6 @@ def _widened(p: Parameter) -> Parameter:
     """The parameter with a prior of more standard deviations."""
     low, high = p.constrain(_WIDER * p.unconstrain(torch.tensor([p.low, p.high], dtype=torch.float64))).tolist()
     return replace(p, low=low, high=high)
-
-
-def _over(log: Log, law: HeadwayLaw, car: GapPlant) -> Followed:
-    data = DriveData.of(replace(log, accel=None, accel_cmd=np.zeros(log.rows)))
-    rows = torch.as_tensor(data.source[:, None] + np.arange(data.group))
-    means = [x[rows].mean(1) for x in seen_in(log)]
-    seen = tuple(FollowerMeasurements(*(x[i:j] for x in means)) for i, j in pairwise(data.bounds.tolist()))
-    return Followed(log, law, car, data, seen)
 
 
 def _even(time: FloatArray) -> FloatArray:
@@ -210,9 +200,10 @@ class Identified:
 
 def identified(candidate: Followed, *, start: Identified | None = None) -> Identified:
     """The fit to the candidate's log, from a short and a long delay, or from another fit's place."""
-    starts = _starts(candidate) if start is None else [np.append(start.z, start.w)]
-    cost = {tuple(x): value for x, value in (_mode(candidate, start) for start in starts)}
-    best = np.array(min(cost, key=lambda x: cost[x]))
+    delays = _DELAYS_S if delay_key() in candidate.coordinates else _DELAYS_S[:1]
+    starts = [(candidate.z_of({delay_key(): delay}), np.zeros(len(_PRIORS))) for delay in delays]
+    starts = starts if start is None else [(start.z, start.w)]
+    best, _ = min((_mode(candidate, np.concatenate(place)) for place in starts), key=lambda found: found[1])
     n = candidate.size
     covariance = np.asarray(np.linalg.inv(_expansion(candidate, best)[1]), np.float64)[:n, :n]
     return Identified(candidate, best[:n], best[n:], covariance)
@@ -284,9 +275,3 @@ def _expansion(own: Followed, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     slopes[:n] = ((np.stack(moved) - residual) / (_STEP * sd)).reshape(n, -1)
     gradient = slopes @ left.ravel() + 0.5 * by_shape @ (1 - left**2).sum(0) + x
     return gradient, slopes @ slopes.T + 0.5 * len(left) * by_shape @ by_shape.T + np.eye(len(x))
-
-
-def _starts(candidate: Followed) -> list[FloatArray]:
-    noise = np.zeros(len(_PRIORS))
-    delays = _DELAYS_S if delay_key() in candidate.coordinates else _DELAYS_S[:1]
-    return [np.append(candidate.z_of({delay_key(): delay}), noise) for delay in delays]

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.arrays import FloatArray
+from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap import Parameter
 from avtorch.gap.quantity import Quantity
@@ -24,6 +24,7 @@ from avtorch.vehicle.stability import chain_verdict, frequencies
 from avtorch.vehicle.stability.chain import actuator
 
 Values = Mapping[str, Tensor]
+_STRETCH_S = 60.0  # of a loop that is simulated from the leader alone
 
 
 class FollowerMeasurements(NamedTuple):
@@ -49,7 +50,6 @@ class HeadwayLaw(Protocol):
         ...
 
 
-@dataclass(frozen=True)
 class ConstantTimeGap:
     """`u = k_s (s - s_0 - h v) + k_v (v_lead - v)`: the linear law of the paper, without its own acceleration.
 
@@ -73,7 +73,6 @@ class ConstantTimeGap:
         return values["standstill_m"] + values["time_gap_s"] * speed
 
 
-@dataclass(frozen=True)
 class IntelligentDriver:
     """The Intelligent Driver Model (Treiber, Hennecke and Helbing 2000, Eq. 2 and 3).
 
@@ -132,7 +131,7 @@ class LoopErrors(NamedTuple):
 
 
 def loop_errors(
-    law: HeadwayLaw, values: Mapping[str, float], seen: FollowerMeasurements, dt: float, *, seconds: float = 60.0
+    law: HeadwayLaw, values: Mapping[str, float], seen: FollowerMeasurements, dt: float, *, seconds: float = _STRETCH_S
 ) -> LoopErrors:
     """Simulate stretches of `seconds` of one drive, in one batch; rows `dt` [s] apart.
 
@@ -140,11 +139,10 @@ def loop_errors(
     """
     own = of_law(values)
     s, v, lead = (x.numpy() for x in seen)
-    length = min(round(seconds / dt), len(s) - 1)
     delay = values.get(delay_key(), 0.0) / dt
     whole, part = int(delay), delay - int(delay)
-    starts = np.arange(0, len(s) - length, length)
-    rows = starts + np.arange(length + 1)[:, None]
+    rows = _stretches(len(s), dt, seconds)
+    starts = rows[0]
     # commands before a stretch follow from the measured motion
     demanded = law.command(own, seen).numpy()
     sent = [demanded[np.maximum(starts - k, 0)] for k in range(whole + 2, 0, -1)]
@@ -152,7 +150,7 @@ def loop_errors(
     speed, spacing = v[rows[0]].copy(), s[rows[0]].copy()
     accel = np.gradient(v, dt)[rows[0]]
     speeds, spacings = [speed], [spacing]
-    for k in range(length):
+    for k in range(len(rows) - 1):
         now = FollowerMeasurements(*(torch.as_tensor(x) for x in (spacing, speed, lead[rows[k]])))
         sent.append(law.command(own, now).numpy())
         acting = (1 - part) * sent[-1 - whole] + part * sent[-2 - whole]
@@ -171,14 +169,19 @@ def loop_errors(
     )
 
 
-def keeps_speed(seen: Sequence[FollowerMeasurements], dt: float, *, seconds: float = 60.0) -> float:
+def keeps_speed(seen: Sequence[FollowerMeasurements], dt: float) -> float:
     """Root mean square error [m/s] over the same stretches of a car that keeps its initial speed."""
     off = []
     for speed in (one.speed.numpy() for one in seen):
-        length = min(round(seconds / dt), len(speed) - 1)
-        rows = np.arange(0, len(speed) - length, length) + np.arange(length + 1)[:, None]
+        rows = _stretches(len(speed), dt, _STRETCH_S)
         off.append((speed[rows] - speed[rows[0]]).ravel())
     return float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
+
+
+def _stretches(count: int, dt: float, seconds: float) -> IntArray:
+    """Rows (step, stretch) of a drive of `count` rows, cut into stretches of so many `seconds`."""
+    length = min(round(seconds / dt), count - 1)
+    return np.arange(0, count - length, length) + np.arange(length + 1)[:, None]
 
 
 def _spread(x: FloatArray) -> float:

@@ -4,7 +4,6 @@ terms."""
 from avtorch.remedy.exports import to_autoware, to_carla, to_openpilot, to_sumo, write_exports
 from avtorch.remedy.trial import Trial
 from avtorch.remedy.what_to_set import WhatToSet, setting_for, what_to_set
-from avtorch.remedy.what_to_set import linearised as linearised
 
 __all__ = [
     "Trial",

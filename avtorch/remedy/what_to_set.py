@@ -24,7 +24,7 @@ from avtorch.decision.grid import GAINS_GRID, Grid
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.gap import GapPlant
-from avtorch.gap.linearised import linearised as linearised
+from avtorch.gap.linearised import linearised
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.effect_response import is_linear, is_one_sided
 from avtorch.vehicle.stability import Chain, chain_verdict
@@ -238,9 +238,8 @@ def _string_stability(chains: Sequence[Chain], settings: Setting) -> tuple[Tenso
     zero, one = torch.zeros_like(settings.T_hat), torch.ones_like(settings.T_hat)
     lower = settings.lower_level(accel_min=-1e9, accel_max=1e9)
     inner, forward = lower.raw_command(one, zero), lower.raw_command(zero, one)
-    stable, peak = None, None
-    for chain in chains:
-        verdict = chain_verdict(
+    verdicts = [
+        chain_verdict(
             chain,
             settings.time_gap[:, None],
             settings.gains[:, None],
@@ -248,11 +247,10 @@ def _string_stability(chains: Sequence[Chain], settings: Setting) -> tuple[Tenso
             forward=forward[:, None],
             feedforward=settings.feedforward[:, None],
         )
-        stable = verdict.string_stable if stable is None else stable & verdict.string_stable
-        peak = verdict.peak_gain if peak is None else torch.maximum(peak, verdict.peak_gain)
-    assert stable is not None
-    assert peak is not None
-    return stable.double().mean(-1), peak
+        for chain in chains
+    ]
+    stable = torch.stack([verdict.string_stable for verdict in verdicts]).all(0)
+    return stable.double().mean(-1), torch.stack([verdict.peak_gain for verdict in verdicts]).amax(0)
 
 
 def _quantiles(peak: Tensor) -> tuple[float, float, float]:

@@ -103,7 +103,7 @@ def test_margin_is_half_the_square_of_the_distance(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     m = [x for x in library() if x.name.startswith("holds")][:1]
     rivals = [contender([], spread=1e-6, rng=rng), contender([SensorBias(0.02)], spread=1e-6, rng=rng)]
-    foretold = [ManoeuvrePrediction.of(r, m, BOTH, 1, 64) for r in rivals]
+    foretold = [ManoeuvrePrediction(r, m, BOTH, 1, 64) for r in rivals]
     law = foretold[0].law(0)
     away = law.whitened((foretold[1].law(0).mean - law.mean)[None])
     distance = float(np.linalg.norm(away))
@@ -116,7 +116,7 @@ def test_the_same_cause_twice_is_never_distinguished(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     one = contender([DeadBand(0.1)], rng=rng)
     m = library()[:1]
-    expected = information([ManoeuvrePrediction.of(one, m, BOTH, 1, 32)] * 2, 0, [0.5, 0.5])
+    expected = information([ManoeuvrePrediction(one, m, BOTH, 1, 32)] * 2, 0, [0.5, 0.5])
     assert expected.nats == pytest.approx(0.0, abs=1e-9)
     assert expected.truth_probability == pytest.approx(0.5)
 
@@ -126,8 +126,8 @@ def test_a_resistance_and_a_bias_differ_in_the_speed_alone(rotating_seed: int) -
     rng = np.random.default_rng(rotating_seed)
     rivals = [contender([ConstantResistance(0.1)], rng=rng), contender([SensorBias(-0.1)], rng=rng)]
     m = [x for x in library() if x.name.startswith("steps")][:1]
-    both = information([ManoeuvrePrediction.of(r, m, BOTH, 1, 32) for r in rivals], 0, [0.5, 0.5])
-    alone = information([ManoeuvrePrediction.of(r, m, ("accel",), 1, 32) for r in rivals], 0, [0.5, 0.5])
+    both = information([ManoeuvrePrediction(r, m, BOTH, 1, 32) for r in rivals], 0, [0.5, 0.5])
+    alone = information([ManoeuvrePrediction(r, m, ("accel",), 1, 32) for r in rivals], 0, [0.5, 0.5])
     assert both.nats == pytest.approx(np.log(2), abs=1e-6)
     assert alone.nats < 0.05
 
@@ -169,9 +169,9 @@ def test_an_unknown_road_widens_the_prediction(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     hilly = contender([RoadGrade(0.02)], rng=rng)
     m = library()[:1]
-    foretold = ManoeuvrePrediction.of(hilly, m, BOTH, 1, 32)
+    foretold = ManoeuvrePrediction(hilly, m, BOTH, 1, 32)
     law = foretold.law(0)
-    flat = ManoeuvrePrediction.of(replace(hilly, grade_rms=None), m, BOTH, 1, 32).law(0)
+    flat = ManoeuvrePrediction(replace(hilly, grade_rms=None), m, BOTH, 1, 32).law(0)
     assert len(law.spread) > len(flat.spread)
     push = 9.81 * 0.02 * np.sin(0.02 * m[0].time)
     pushed = law.mean + foretold.coefficients(np.stack([push, np.cumsum(push) * 0.05])[None])

@@ -62,8 +62,8 @@ def fitted(log: Log, most: int = 50) -> tuple[dict[str, tuple[float, float, bool
         return [[driven_along(with_values(own, values), log)] for values in places]
 
     rollouts = Rollouts([log], values_of(own, LIMITS), drive, most)
-    found = adjusted(rollouts, LIMITS)
-    return {p.name: (p.car.mean, p.car.sd, p.differs) for p in found.parameters}, len(found.rollouts)
+    _, found = adjusted(rollouts, LIMITS)
+    return {p.name: (p.car.mean, p.car.sd, p.differs) for p in found}, len(rollouts)
 
 
 @pytest.mark.statistical
@@ -140,9 +140,9 @@ def test_a_missing_effect_is_not_taken_for_a_wrong_parameter() -> None:
     car = plant([DeadTime(0.3)], T_L=0.3, sigma=0.05)
     log = simulate(Leader.default(start=30.0, duration=60.0, dt=0.05), plant=car).log()
     mine = ExternalSimulator(Truck, adjustable=LIMITS)
-    alone = mine.beside([log]).fitted
-    assert alone is not None
-    assert not any(p.differs for p in alone.parameters)
+    alone = mine.beside([log]).own
+    assert alone
+    assert not any(p.differs for p in alone)
     found = diagnose(log, baseline=mine, effects=["dead_time", "sensor_bias"], pairs=False, posterior="laplace")
     assert found.tested is not None
     assert found.tested.missing == ("dead_time",)
@@ -162,10 +162,9 @@ def test_a_wrong_parameter_is_no_missing_effect() -> None:
 
 def test_processes_change_nothing_but_the_time() -> None:
     log = recorded(Truck(lag=0.5), 5, seconds=40.0)
-    one, two = (ExternalSimulator(Truck, adjustable=LIMITS, processes=count).beside([log]).fitted for count in (1, 2))
-    assert one is not None
-    assert two is not None
-    assert one.parameters == two.parameters
+    one, two = (ExternalSimulator(Truck, adjustable=LIMITS, processes=count).beside([log]).own for count in (1, 2))
+    assert len(one) == 2
+    assert one == two
     with pytest.raises(InputError, match="processes: found 0, needs a number from 1 to 64"):
         ExternalSimulator(Truck, processes=0)
 

@@ -68,15 +68,11 @@ def expected(**given: float) -> tuple[list[float], list[float]]:
     return fmus.drive(COMMAND, DT, **{"speed": 20.0, "accel": 0.4, **given})
 
 
-def test_a_drive_is_the_models_own(build: Build, fmi: int) -> None:
+def test_a_drive_is_the_models_own_step_by_step_and_again(build: Build, fmi: int) -> None:
     car = build.open(build.fmu(fmi))
     assert isinstance(car, Simulator)
-    np.testing.assert_allclose(driven(car), expected(), **CLOSE)
-
-
-def test_a_drive_is_its_steps_and_a_second_one_is_the_same(build: Build, fmi: int) -> None:
-    car = build.open(build.fmu(fmi))
     accel, speed = driven(car)
+    np.testing.assert_allclose((accel, speed), expected(), **CLOSE)
     car.reset(speed=20.0, accel=0.4)
     steps = [car.step(u, DT) for u in COMMAND[:10].tolist()]
     assert steps == list(zip(accel[:10], speed[:10], strict=True))
@@ -102,23 +98,19 @@ def test_units_that_the_fmu_states_are_converted(build: Build, fmi: int, accel: 
     np.testing.assert_allclose(driven(car), expected(), **CLOSE)
 
 
-def test_units_that_are_given_overrule_the_fmu(build: Build) -> None:
-    car = build.open(build.fmu(given=fmus.variables(units={"v": "m/s"})), unit={"speed": "km/h"})
-    np.testing.assert_allclose(driven(car.with_parameters({"speed_scale": 3.6}))[1], expected()[1], **CLOSE)
-    assert any("km/h as given" in note for note in car.notes)
-
-
-def test_a_unit_in_the_name_counts(build: Build) -> None:
-    car = build.open(build.fmu(given=fmus.variables(names={"v": "vehicle_speed_kmh"})))
-    assert any("in km/h by its name" in note for note in car.notes)
+@pytest.mark.parametrize(
+    ("of", "unit", "told"),
+    [
+        ({"units": {"v": "m/s"}}, {"speed": "km/h"}, "in km/h as given"),  # overrules the FMU's own
+        ({"names": {"v": "vehicle_speed_kmh"}}, None, "in km/h by its name"),
+    ],
+    ids=["given", "in the name"],
+)
+def test_a_unit_that_the_fmu_does_not_state(build: Build, of: dict, unit: dict | None, told: str) -> None:
+    car = build.open(build.fmu(given=fmus.variables(**of)), unit=unit)
+    assert any(told in note for note in car.notes)
     shown = driven(car.with_parameters({"speed_scale": 3.6}), speed=0.0)[1]
     np.testing.assert_allclose(shown, expected(speed=0.0)[1], **CLOSE)
-
-
-def test_a_unit_of_another_quantity_is_refused(build: Build, fmi: int) -> None:
-    path = build.fmu(fmi, fmus.variables(units={"u": "N"}))
-    with pytest.raises(InputError, match=r"accel_cmd is variable 'u' in 'N'; .*\[fmu\.unit\]"):
-        build.open(path)
 
 
 # names -------------------------------------------------------------------------------------------------------------
@@ -143,11 +135,33 @@ def test_of_several_inputs_the_one_that_fits_is_taken(build: Build, name: str, u
     np.testing.assert_allclose(driven(car), expected(), **CLOSE)
 
 
-def test_several_that_may_be_meant_are_listed(build: Build) -> None:
-    with pytest.raises(
-        InputError, match=r"accel may be several .*: y1 \[m/s2\], y2 \[m/s\], drag \[m/s2\]; needs map="
-    ):
-        build.open(build.fmu(given=ambiguous()))
+def without_a_speed() -> dict[str, dict]:
+    given = fmus.variables()
+    given["v"]["causality"] = "local"
+    return given
+
+
+def of_pedals() -> dict[str, dict]:
+    """Before, a map was asked for, which no FMU of two pedals can be given."""
+    given = fmus.variables()
+    given["u"]["name"] = "throttle"
+    given["omega"] |= {"name": "brake", "causality": "input"}
+    return given
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        (ambiguous(), r"accel may be several .*: y1 \[m/s2\], y2 \[m/s\], drag \[m/s2\]; needs map="),
+        (without_a_speed(), r"speed may be several of its outputs, or none: a; needs map="),
+        (of_pedals(), r"takes throttle.*brake.*, and no acceleration.*--simulated"),
+        (fmus.variables(units={"u": "N"}), r"accel_cmd is variable 'u' in 'N'; .*\[fmu\.unit\]"),
+    ],
+    ids=["several", "no speed", "pedals", "force"],
+)
+def test_an_fmu_whose_signals_are_not_found_is_refused(build: Build, given: dict, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        build.open(build.fmu(given=given))
 
 
 @pytest.mark.parametrize("way", ["argument", "beside", "mapping"])
@@ -204,13 +218,6 @@ def test_a_mapping_file_that_is_wrong_is_refused(build: Build, text: str, messag
         build.open(path)
 
 
-def test_an_fmu_without_a_speed_is_refused(build: Build) -> None:
-    given = fmus.variables()
-    given["v"]["causality"] = "local"
-    with pytest.raises(InputError, match=r"speed may be several of its outputs, or none: a; needs map="):
-        build.open(build.fmu(given=given))
-
-
 # start -------------------------------------------------------------------------------------------------------------
 def test_a_start_that_cannot_be_set_is_the_fmus_own_and_told(build: Build) -> None:
     car = build.open(build.fmu(), map={"accel0": "a0"})
@@ -264,13 +271,6 @@ def test_steps_must_be_alike_where_the_fmu_says_no_more(build: Build) -> None:
 @pytest.mark.parametrize(("fmi", "step"), [(2, 0.0), (3, -1.0), (2, np.nan), (3, np.inf)])
 def test_a_step_that_is_stated_and_is_none_counts_as_unstated(build: Build, fmi: int, step: float) -> None:
     np.testing.assert_allclose(driven(build.open(build.fmu(fmi, step=step))), expected(), **CLOSE)
-
-
-def test_a_step_that_is_none_is_refused(build: Build) -> None:
-    car = build.open(build.fmu())
-    for dt in (0.0, -0.1, np.nan, np.inf):
-        with pytest.raises(InputError, match="dt: found"):
-            driven(car, dt)
 
 
 # parameters --------------------------------------------------------------------------------------------------------
@@ -361,6 +361,9 @@ def test_numbers_that_are_none_are_refused(build: Build) -> None:
         car.reset(speed=np.inf, accel=0.0)
     with pytest.raises(InputError, match=r"shapes \(3,\) and \(2,\)"):
         car.whole_drive([0.0, 0.0, 0.0], [DT, DT], speed=20.0, accel=0.0)
+    for dt in (0.0, -0.1, np.nan, np.inf):
+        with pytest.raises(InputError, match="dt: found"):
+            driven(car, dt)
 
 
 def test_what_is_closed_is_refused(build: Build) -> None:
@@ -400,12 +403,3 @@ def test_what_is_not_installed_is_told(build: Build, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "fmpy" else there(name, *rest))
     with pytest.raises(InputError, match=re.escape("pip install 'avtorch[fmu]'")):
         build.open(build.fmu())
-
-
-def test_an_fmu_of_pedals_is_refused_as_that(build: Build) -> None:
-    """Before, a map was asked for, which no FMU of two pedals can be given."""
-    given = fmus.variables()
-    given["u"]["name"] = "throttle"
-    given["omega"] |= {"name": "brake", "causality": "input"}
-    with pytest.raises(InputError, match=r"takes throttle.*brake.*, and no acceleration.*--simulated"):
-        build.open(build.fmu(given=given))

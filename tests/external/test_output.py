@@ -9,7 +9,7 @@ import pytest
 
 from avtorch import ExternalSimulator, InputError, diagnose
 from avtorch.external.driving import aligned
-from avtorch.external.external_simulator import discrepancy, without_discrepancy
+from avtorch.external.external_simulator import discrepancy, less
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.io import Log
 from tests.external.cars import OWN, drive
@@ -42,7 +42,7 @@ def test_the_surrogate_is_what_the_simulator_is_made_of(surrogate: Surrogate) ->
 def test_the_discrepancy_is_what_the_surrogate_leaves(as_it_is: tuple[Log, Log], surrogate: Surrogate) -> None:
     """Less its discrepancy the simulator's own output is its surrogate's, to rounding."""
     _, simulated = as_it_is
-    freed = without_discrepancy(simulated, simulated, surrogate.plant)
+    freed = less(simulated, simulated, discrepancy(simulated, surrogate.plant))
     rest = discrepancy(replace(freed, speed=simulated.speed), surrogate.plant)
     assert np.abs(rest["accel"]).max() < 1e-9
 

@@ -17,7 +17,7 @@ from avtorch.gap import (
     SensorScale,
     plant,
 )
-from avtorch.remedy import linearised
+from avtorch.gap.linearised import linearised
 
 T, K = 0.5, 0.8
 
