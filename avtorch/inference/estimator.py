@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from torch import Tensor
@@ -12,7 +13,6 @@ from avtorch.inference.belief import Belief, Summary
 from avtorch.inference.device import Device, checked_device, generator_on
 from avtorch.inference.form import Form, Rows, WindowLikelihood
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior
-from avtorch.inference.state import shaped_as
 
 
 class Estimator(ABC):
@@ -54,6 +54,13 @@ class Estimator(ABC):
     def take(self, rows: Rows, likelihood: WindowLikelihood) -> Belief:
         """Take in one window: its rows, each column ``(vehicle, time)``, and what the form makes of them."""
 
+    def _updated(self, excited: Tensor, learn: Callable[[Tensor], tuple[Summary, Tensor]]) -> Belief:
+        """The belief after a window, of which ``learn`` gives what it makes of the excited vehicles, named by an index:
+        their summary, and where it may be used, ``(vehicle,)`` bool. The others keep their belief."""
+        index = excited.nonzero().squeeze(-1)
+        self.belief = self.belief.updated(excited, index, *learn(index)) if len(index) else self.belief.unused(excited)
+        return self.belief
+
     def _remember(self, index: Tensor, **found: Tensor) -> None:
         """Keep what was found of the vehicles ``index``."""
         self._memory |= {name: self._memory[name].index_put((index,), value) for name, value in found.items()}
@@ -75,7 +82,7 @@ class Estimator(ABC):
                 found = f"{str(state.get(key))[:80]} when it was saved, here it is {own.get(key)}"
                 raise InputError(f"state: {key} was {found}")
         shaped_as(own, state, "state")
-        self.belief = self.belief.taken_from(state)
+        self.belief = Belief.of_state(state, self.device)
         self._memory = {name: value.clone().to(self.device) for name, value in state["memory"].items()}
         self.generator.set_state(state["generator"])
 
@@ -92,15 +99,44 @@ class WindowedEstimator(Estimator):
 
     def take(self, rows: Rows, likelihood: WindowLikelihood) -> Belief:
         """Take in one window of every vehicle; those that are not excited keep their belief."""
-        index = likelihood.excited.nonzero().squeeze(-1)
-        if len(index):
+
+        def learn(index: Tensor) -> tuple[Summary, Tensor]:
             excited = {name: rows[name][index] for name in ("usable", *self.form.columns)}
-            found, converged = self._learn({"time": rows["time"], **excited}, index)
-            self.belief = self.belief.updated(likelihood.excited, index, found, converged)
-        else:
-            self.belief = self.belief.unused(likelihood.excited)
-        return self.belief
+            return self._learn({"time": rows["time"], **excited}, index)
+
+        return self._updated(likelihood.excited, learn)
 
     @abstractmethod
     def _learn(self, rows: Rows, index: Tensor) -> tuple[Summary, Tensor]:
         """The summary of the vehicles ``index`` from their rows, and where it may be used, ``(vehicle,)`` bool."""
+
+
+def shaped_as(own: Any, given: Any, place: str) -> None:
+    """Check a saved state against one's own: the same keys, types, dtypes and shapes, and finite numbers throughout.
+
+    What was damaged on its way is found by the checksum of the file that holds it. Raises `InputError` that names the
+    `place` within the state.
+    """
+    if isinstance(own, Tensor):
+        if not isinstance(given, Tensor) or given.dtype != own.dtype or given.shape != own.shape:
+            found = f"{given.dtype} of shape {tuple(given.shape)}" if isinstance(given, Tensor) else _kind(given)
+            raise InputError(f"{place}: found {found}, needs {own.dtype} of shape {tuple(own.shape)}")
+        if own.dtype.is_floating_point and not bool(given.isfinite().all()):
+            raise InputError(f"{place}: holds numbers that are not finite")
+    elif type(given) is not type(own):
+        raise InputError(f"{place}: found {_kind(given)}, needs {_kind(own)}")
+    elif isinstance(own, Mapping):
+        if set(given) != set(own):
+            found, needed = (", ".join(sorted(map(str, x)))[:200] or "nothing" for x in (given, own))
+            raise InputError(f"{place}: found {found}, needs {needed}")
+        for key, value in own.items():
+            shaped_as(value, given[key], f"{place}.{key}")
+    elif isinstance(own, (list, tuple)):
+        if len(given) != len(own):
+            raise InputError(f"{place}: found {len(given)} entries, needs {len(own)}")
+        for i, value in enumerate(own):
+            shaped_as(value, given[i], f"{place}[{i}]")
+
+
+def _kind(x: Any) -> str:
+    return f"a {type(x).__name__}"

@@ -24,8 +24,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float, Int
 from avtorch.inference.chains import rhat_of_halves
 from avtorch.inference.coordinates import Coordinates
-from avtorch.inference.density import Density, has_selection, score_of, selected
-from avtorch.inference.exponential_form import matvec
+from avtorch.inference.density import Density, has_selection, matvec, score_of, selected
 from avtorch.inference.importance import RELIABLE, pareto_k
 from avtorch.inference.map import find_mode
 

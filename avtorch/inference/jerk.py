@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int, Real
+from avtorch.inference.density import ExponentialForm, PotentialTerms
 from avtorch.inference.device import Device
-from avtorch.inference.exponential_form import ExponentialForm, PotentialTerms
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
 from avtorch.vehicle.glvd import glvd_jerk
 

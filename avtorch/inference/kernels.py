@@ -1,7 +1,7 @@
 """The SGLD walk as a compiled loop (numba).
 
 What a step does is that of :class:`~avtorch.inference.sgld.SGLD`; the density is an
-:class:`~avtorch.inference.exponential_form.ExponentialForm`. A chain's noise is a function of seed, window, chain and
+:class:`~avtorch.inference.density.ExponentialForm`. A chain's noise is a function of seed, window, chain and
 step alone (Philox 4x32-10; Salmon et al. 2011), so it depends neither on the number of threads nor on that of chains.
 
 Everything compiled stands in this file: numba's cache on disk is renewed when the file changes, and only then. Nothing

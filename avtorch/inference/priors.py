@@ -16,7 +16,7 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
-from avtorch.inference.exponential_form import PotentialTerms
+from avtorch.inference.density import PotentialTerms
 from avtorch.vehicle.arguments import broadcast_shape
 
 _LOG_2PI = math.log(2 * math.pi)
