@@ -11,7 +11,7 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
 from avtorch.display import Card, Displayed, Frame
-from avtorch.inference.arviz_export import UNITS, inference_data, parameter_table
+from avtorch.inference.arviz_export import UNITS, draws_frame, inference_data, parameter_table
 from avtorch.inference.chains import quantiles_of
 from avtorch.inference.device import Device
 from avtorch.inference.priors import Prior
@@ -108,13 +108,7 @@ class Belief(Displayed):
 
     def to_dataframe(self) -> pandas.DataFrame:
         """The draws, a row a draw and vehicle, a column a parameter. Needs ``pip install 'avtorch[pandas]'``."""
-        draws, vehicles, _ = self.draws.shape
-        index = {
-            "draw": torch.arange(draws).repeat_interleave(vehicles).numpy(),
-            "vehicle": torch.arange(vehicles).repeat(draws).numpy(),
-        }
-        columns = {name: self.draws[..., i].flatten().cpu().numpy() for i, name in enumerate(self.names)}
-        return Frame(index | columns).to_dataframe()
+        return draws_frame(self.names, self.draws, ("draw", "vehicle")).to_dataframe()
 
     def to_arviz(self) -> InferenceData:
         """The draws as one chain, variables ``(chain, draw, vehicle)``. Needs ``pip install 'avtorch[arviz]'``.

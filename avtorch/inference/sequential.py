@@ -17,8 +17,7 @@ from avtorch.errors import InputError
 from avtorch.inference.belief import Belief, Summary
 from avtorch.inference.chains import quantiles_of
 from avtorch.inference.density import Density, SelectableDensity
-from avtorch.inference.estimator import Estimator
-from avtorch.inference.form import Rows, WindowLikelihood
+from avtorch.inference.estimator import Estimator, Rows, WindowLikelihood
 from avtorch.inference.importance import ImportanceSettings, WeightedDraws, weighted_draws
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.priors import Joint, LogSpaceNormal, Prior, QuadrantNormal, Switch, default_jerk_noise_prior
