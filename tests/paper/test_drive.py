@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from avtorch.decision.settings import Setting
-from avtorch.paper.drive import ACT_S, drive, noise_seeds, rms_about_mean, rows_from, stacked
+from avtorch.paper.drive import ACT_S, drive, noise_seeds, rows_from, stacked
 from avtorch.vehicle import Leader
+from avtorch.vehicle.performance import rms_about_mean
 from tests.bars import BAR
 
 SETTINGS = stacked([Setting(scenarios=1), Setting(time_gap=2.0), Setting(1.33, 0.64, gains=(3.0, 3.0, -1.8))])

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from avtorch.paper import Leaders, Platoon, platoon
-from avtorch.paper.drive import rms_about_mean, rows_from
+from avtorch.paper.drive import rows_from
 from avtorch.paper.platoon import ACT_S, PASSED_S, VEHICLES
+from avtorch.vehicle.performance import rms_about_mean
 
 pytestmark = pytest.mark.slow  # all tests need the experiment itself
 
