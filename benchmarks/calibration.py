@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference.form import ExcitationRule
-from avtorch.inference.jerk import JerkDensity
+from avtorch.inference.jerk import ExcitationRule, JerkDensity
 from avtorch.inference.priors import Prior
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings

@@ -21,10 +21,10 @@ from torch import Tensor
 
 from avtorch.inference.density import Density
 from avtorch.inference.estimators import ImportanceSampling
-from avtorch.inference.estimators.other_posteriors import FIRST, _Solved
 from avtorch.inference.importance import weighted_draws
 from avtorch.inference.latent import LatentDensity, default_noise_prior
 from avtorch.inference.map import Mode
+from avtorch.inference.sequential import FIRST, Solved
 from tests.inference.latent_windows import drawn_window
 
 KINDS = {
@@ -40,7 +40,7 @@ QUANTA = {"speed": 0.02, "accel": 0.05}
 class Drawn(ImportanceSampling):
     """Weighted draws alone, without SGLD behind them."""
 
-    def _chains(self, density: Density, mode: Mode) -> _Solved:
+    def _chains(self, density: Density, mode: Mode) -> Solved:
         return self._drawn(density, mode, FIRST)._replace(converged=torch.zeros(density.windows, dtype=torch.bool))
 
 

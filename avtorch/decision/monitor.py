@@ -29,7 +29,7 @@ from avtorch.decision.charts import CHARTS, Chart
 from avtorch.decision.divergence import DIVERGENCES, Gaussian, divergence, divergence_p_value, innovation
 from avtorch.decision.settings import Setting
 from avtorch.errors import InputError
-from avtorch.inference.state import shaped_as
+from avtorch.inference.estimator import shaped_as
 
 DETECTORS = ("stability", "accepted_change", *DIVERGENCES, *CHARTS)
 """All detectors, in order of precedence."""

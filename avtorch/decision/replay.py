@@ -103,64 +103,39 @@ def replay(
     loop.
     """
     strides = (torch.clamp_max(T_L / 6.0, dt) / history.dt + 1e-9).long().clamp(1, history.lead_speed.shape[1] - 1)
-    out: Performance | None = None
-    # The step follows from the scenario's own lag, so its prediction does not depend on the rest of the batch.
-    for stride in strides.unique().tolist():
-        rows = torch.nonzero(strides == stride)[:, 0]
-        seen = _replay_at(
-            history[rows].thinned(int(stride)),
-            setting[rows],
+
+    def at_stride(stride: int, rows: Tensor) -> Performance:
+        past, those = history[rows].thinned(stride), setting[rows]
+        loop = ClosedLoop(
+            past.leader(),
             plant=GLVDPlant(T_L[rows], K_L[rows], 0.0),
-            time_gap_now=time_gap_now[rows],
-            limits=(of_scenarios(accel_min, rows), of_scenarios(accel_max, rows)),
-            standstill=standstill,
-            ramp_rate=ramp_rate,
-            delay=delay,
+            scenarios=len(rows),
+            spacing0=past.spacing.clamp_min(0.1),
+            speed0=past.speed.clamp_min(0.0),
             link_delay=link_delay,
         )
-        if len(rows) == setting.shape[0]:
-            return seen
-        if out is None:
-            out = seen.map(lambda x: torch.zeros(setting.shape, dtype=torch.float64))
-        for name, value in vars(seen).items():
-            getattr(out, name)[rows] = value
-    assert out is not None
-    return out
+        limits = {"accel_min": of_scenarios(accel_min, rows), "accel_max": of_scenarios(accel_max, rows)}
+        parts: list[Performance] = []
+        each = max(1, _ROWS // len(rows))
+        for first in range(0, setting.shape[1], each):
+            some = those[:, first : first + each].map(lambda _, x: x.transpose(0, 1))  # (candidate, scenario)
+            twin = loop.copy(candidates=some.shape[0])
+            start = Setting(time_gap=time_gap_now[rows], gains=some.gains).controller(standstill=standstill)
+            twin.controller = some.retarget(start, at=delay, rate=ramp_rate)
+            twin.lower_level = some.lower_level(**limits)
+            run = twin.advance(past.lead_speed.shape[1])
+            parts.append(performance(run, time_gap=some.time_gap, standstill=standstill))
+        return _joined(parts).map(lambda x: x.mT)
+
+    # The step follows from the scenario's own lag, so its prediction does not depend on the rest of the batch.
+    groups = [(stride, torch.nonzero(strides == stride)[:, 0]) for stride in strides.unique().tolist()]
+    whole = _joined([at_stride(stride, rows) for stride, rows in groups])
+    order = torch.cat([rows for _, rows in groups]).argsort()
+    return whole.map(lambda x: x[order])
 
 
-def _replay_at(
-    past: History,
-    setting: Setting,
-    *,
-    plant: GLVDPlant,
-    time_gap_now: Tensor,
-    limits: tuple[Number, Number],
-    standstill: float,
-    ramp_rate: float,
-    delay: float,
-    link_delay: float,
-) -> Performance:
-    """`replay` at the step of `past`."""
-    scenarios, candidates = setting.shape
-    loop = ClosedLoop(
-        past.leader(),
-        plant=plant,
-        scenarios=scenarios,
-        spacing0=past.spacing.clamp_min(0.1),
-        speed0=past.speed.clamp_min(0.0),
-        link_delay=link_delay,
-    )
-    parts = []
-    each = max(1, _ROWS // scenarios)
-    for first in range(0, candidates, each):
-        some = setting[:, first : first + each].map(lambda _, x: x.transpose(0, 1))  # (candidate, scenario)
-        twin = loop.copy(candidates=some.shape[0])
-        start = Setting(time_gap=time_gap_now, gains=some.gains).controller(standstill=standstill)
-        twin.controller = some.retarget(start, at=delay, rate=ramp_rate)
-        twin.lower_level = some.lower_level(accel_min=limits[0], accel_max=limits[1])
-        run = twin.advance(past.lead_speed.shape[1])
-        parts.append(performance(run, time_gap=some.time_gap, standstill=standstill))
-    return Performance(*(torch.cat(column).mT for column in zip(*(vars(p).values() for p in parts), strict=True)))
+def _joined(parts: Sequence[Performance]) -> Performance:
+    return Performance(*(torch.cat(column) for column in zip(*(vars(p).values() for p in parts), strict=True)))
 
 
 def of_scenarios(limit: Number, rows: Tensor) -> Number:

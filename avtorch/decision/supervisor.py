@@ -15,7 +15,7 @@ from avtorch.decision.strategist import Strategist
 from avtorch.decision.watch import Action, SupervisedRun, Watch, WatchedWindow
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
-from avtorch.inference.form import JerkForm
+from avtorch.inference.jerk import JerkForm
 from avtorch.inference.latent import LatentForm
 from avtorch.inference.stream import BeliefStream
 from avtorch.io.log import STANDSTILL_MPS

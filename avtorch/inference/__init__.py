@@ -19,8 +19,15 @@ from avtorch.inference.density import (
     SelectableDensity,
     SubsampledDensity,
 )
-from avtorch.inference.form import ExcitationRule, Form, JerkForm, WindowLikelihood
-from avtorch.inference.jerk import JerkDensity, JerkPoints, JerkStatistics, jerk_log_likelihood
+from avtorch.inference.estimator import Form, WindowLikelihood
+from avtorch.inference.jerk import (
+    ExcitationRule,
+    JerkDensity,
+    JerkForm,
+    JerkPoints,
+    JerkStatistics,
+    jerk_log_likelihood,
+)
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.posterior import Posterior
 from avtorch.inference.quadrature import Quadrature, integrate

@@ -7,9 +7,11 @@ from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.display import Frame
 from avtorch.errors import InputError
 
@@ -50,6 +52,13 @@ def parameter_table(
             **{key: values.repeat_interleave(len(names)).tolist() for key, values in (flags or {}).items()},
         }
     )
+
+
+def draws_frame(names: Sequence[str], draws: Float[Tensor, "*place parameter"], dims: Sequence[str]) -> Frame:
+    """A row a draw, its place by ``dims``, and a column a parameter."""
+    place = torch.meshgrid(*(torch.arange(n) for n in draws.shape[:-1]), indexing="ij")
+    index = {dim: at.flatten().numpy() for dim, at in zip(dims, place, strict=True)}
+    return Frame(index | {name: draws[..., i].flatten().cpu().numpy() for i, name in enumerate(names)})
 
 
 def arviz() -> ModuleType:

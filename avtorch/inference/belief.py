@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -10,12 +11,10 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
 from avtorch.display import Card, Displayed, Frame
-from avtorch.errors import InputError
-from avtorch.inference.arviz_export import UNITS, inference_data, parameter_table
+from avtorch.inference.arviz_export import UNITS, draws_frame, inference_data, parameter_table
 from avtorch.inference.chains import quantiles_of
 from avtorch.inference.device import Device
 from avtorch.inference.priors import Prior
-from avtorch.inference.state import shaped_as
 
 if TYPE_CHECKING:
     import pandas
@@ -23,6 +22,9 @@ if TYPE_CHECKING:
 
 Z90 = 1.6448536269514722
 """The standard normal's 95 % quantile: 90 % lie within this many SDs."""
+
+_FIGURES = ("mean", "sd", "q05", "q95")
+_TENSORS = (*_FIGURES, "draws", "excited", "converged")
 
 
 class Summary(NamedTuple):
@@ -53,6 +55,15 @@ class Summary(NamedTuple):
         draws = mean_z + torch.einsum("vij,kvj->kvi", basis * values.clamp_min(0.0).sqrt().unsqueeze(-2), noise)
         low, high = (mean_z - Z90 * sd_z).exp(), (mean_z + Z90 * sd_z).exp()
         return cls(mean, mean * sd_z.square().expm1().sqrt(), low, high, draws.exp())
+
+    def put(self, index: Int[Tensor, " some"], other: Summary) -> Summary:
+        """The vehicles ``index`` taken from ``other``."""
+        figures = (mine.index_copy(0, index, theirs) for mine, theirs in zip(self[:4], other[:4], strict=True))
+        return Summary(*figures, draws=self.draws.index_copy(1, index, other.draws))
+
+    def select(self, where: Bool[Tensor, " vehicle"]) -> Summary:
+        """The vehicles ``where`` it is true."""
+        return Summary(*(x[where] for x in self[:4]), draws=self.draws[:, where])
 
 
 @dataclass(frozen=True, repr=False)
@@ -92,18 +103,12 @@ class Belief(Displayed):
 
     def summary(self) -> Frame:
         """A row a vehicle and parameter: mean, sd, the 5 and 95 % quantiles; `used`: the window updated it."""
-        stats = {key: getattr(self, key) for key in ("mean", "sd", "q05", "q95")}
+        stats = {key: getattr(self, key) for key in _FIGURES}
         return parameter_table("vehicle", self.names, stats, {"used": self.excited & self.converged})
 
     def to_dataframe(self) -> pandas.DataFrame:
         """The draws, a row a draw and vehicle, a column a parameter. Needs ``pip install 'avtorch[pandas]'``."""
-        draws, vehicles, _ = self.draws.shape
-        index = {
-            "draw": torch.arange(draws).repeat_interleave(vehicles).numpy(),
-            "vehicle": torch.arange(vehicles).repeat(draws).numpy(),
-        }
-        columns = {name: self.draws[..., i].flatten().cpu().numpy() for i, name in enumerate(self.names)}
-        return Frame(index | columns).to_dataframe()
+        return draws_frame(self.names, self.draws, ("draw", "vehicle")).to_dataframe()
 
     def to_arviz(self) -> InferenceData:
         """The draws as one chain, variables ``(chain, draw, vehicle)``. Needs ``pip install 'avtorch[arviz]'``.
@@ -117,7 +122,7 @@ class Belief(Displayed):
     def stat(self, name: str, vehicle: int = 0) -> dict[str, float]:
         """``{"mean", "sd", "q05", "q95"}`` of one parameter of one vehicle."""
         i = self.names.index(name)
-        return {key: float(getattr(self, key)[vehicle, i]) for key in ("mean", "sd", "q05", "q95")}
+        return {key: float(getattr(self, key)[vehicle, i]) for key in _FIGURES}
 
     def updated(
         self,
@@ -127,15 +132,9 @@ class Belief(Displayed):
         converged: Bool[Tensor, " used"],
     ) -> Belief:
         """After a window: ``found`` of the vehicles ``index`` where it ``converged``, all others carried over."""
-        used = index[converged]
-        table = {key: getattr(self, key) for key in ("mean", "sd", "q05", "q95")}
-        table = {key: value.index_put((used,), getattr(found, key)[converged]) for key, value in table.items()}
-        draws = self.draws
-        if len(used):
-            draws = draws.clone()
-            draws[:, used] = found.draws[:, converged]
-        converged = torch.ones_like(excited).index_put((index,), converged)
-        return Belief(self.names, draws=draws, excited=excited, converged=converged, **table)
+        before = Summary(self.mean, self.sd, self.q05, self.q95, self.draws)
+        after = before.put(index[converged], found.select(converged))
+        return Belief(self.names, *after, excited, torch.ones_like(excited).index_put((index,), converged))
 
     def unused(self, excited: Bool[Tensor, " vehicle"]) -> Belief:
         """After a window that no vehicle used: all carried over."""
@@ -143,24 +142,16 @@ class Belief(Displayed):
 
     def state_dict(self) -> dict[str, Any]:
         """Plain tensors, on the processor, and names."""
-        keys = ("mean", "sd", "q05", "q95", "draws", "excited", "converged")
-        return {"names": list(self.names), **{key: getattr(self, key).cpu() for key in keys}}
-
-    def taken_from(self, state: dict[str, Any]) -> Belief:
-        """The inverse of :meth:`state_dict`, for the same parameters, vehicles and draws; other entries are ignored.
-
-        Raises `InputError` for other parameters, shapes or types.
-        """
-        own = self.state_dict()
-        shaped_as(own, {key: state[key] for key in own if key in state}, "state")
-        if state["names"] != own["names"]:
-            raise InputError(f"state: found the parameters {state['names']}, needs {own['names']}")
-        return Belief(self.names, **{key: state[key].clone() for key in own if key != "names"}).to(self.mean.device)
+        return {"names": list(self.names), **{key: getattr(self, key).cpu() for key in _TENSORS}}
 
     def to(self, device: Device) -> Belief:
         """The same on another device."""
-        keys = ("mean", "sd", "q05", "q95", "draws", "excited", "converged")
-        return Belief(self.names, **{key: getattr(self, key).to(device) for key in keys})
+        return Belief(self.names, *(getattr(self, key).to(device) for key in _TENSORS))
+
+    @classmethod
+    def of_state(cls, state: Mapping[str, Any], device: Device) -> Belief:
+        """The inverse of :meth:`state_dict`; other entries are ignored."""
+        return cls(tuple(state["names"]), *(state[key].clone().to(device) for key in _TENSORS))
 
     @classmethod
     def of_prior(cls, names: tuple[str, ...], prior: Prior, kept: int, vehicles: int, g: torch.Generator) -> Belief:

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from avtorch.arrays import Float
 from avtorch.inference.coordinates import Coordinates
-from avtorch.inference.density import Density
-from avtorch.inference.exponential_form import ExponentialForm, has_form
+from avtorch.inference.density import Density, ExponentialForm, exponential_form
 from avtorch.inference.sampler_settings import SamplerSettings
 
 #: Steps of single chains below which a second thread costs more than it saves, some milliseconds of work.
@@ -42,10 +41,11 @@ def load_kernels(module: Literal["kernels", "latent_kernels"]) -> ModuleType | N
 def compiled_form(density: Density, settings: SamplerSettings) -> ExponentialForm | None:
     """The density as the compiled walk takes it; None where density or settings are for the eager one."""
     others = (settings.batch, settings.schedule, settings.optimizer)
-    if settings.walk == "eager" or any(other is not None for other in others) or not has_form(density):
+    if settings.walk == "eager" or any(other is not None for other in others):
         return None
-    form = density.exponential_form
-    return form if form.coupling.device.type == "cpu" and load_kernels("kernels") is not None else None
+    form = exponential_form(density)
+    here = form is not None and form.coupling.device.type == "cpu"
+    return form if here and load_kernels("kernels") is not None else None
 
 
 def compiled_walk(

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Float
-from avtorch.inference.density import Density, score_of
-from avtorch.inference.exponential_form import matvec
+from avtorch.inference.density import Density, matvec, score_of
 from avtorch.inference.map import Mode
 
 Whitening = Literal["full", "diagonal", "none"]

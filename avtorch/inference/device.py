@@ -28,11 +28,6 @@ def checked_device(device: Device) -> torch.device:
     return tried.device  # with its number
 
 
-def generator_on(device: torch.device, seed: int) -> torch.Generator:
-    """A generator on the device, as its random numbers need one."""
-    return torch.Generator(device=device).manual_seed(seed)
-
-
 def check_generator(generator: torch.Generator | None, device: torch.device) -> None:
     """Raises `InputError` for a generator of another device."""
     if generator is not None and generator.device.type != device.type:

@@ -1,18 +1,64 @@
-"""What every estimator in a stream of windows shares: a belief per vehicle, what it remembers beside it, and resume."""
+"""What every estimator in a stream of windows takes, and what all of them share.
+
+It takes a form of the log density, and the likelihood that the form gives of a window of rows. Shared are a belief per
+vehicle, what an estimator remembers beside it, and resume.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Real
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief, Summary
-from avtorch.inference.device import Device, checked_device, generator_on
-from avtorch.inference.form import Form, Rows, WindowLikelihood
+from avtorch.inference.density import Density
+from avtorch.inference.device import Device, checked_device
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior
-from avtorch.inference.state import shaped_as
+from avtorch.inference.sampler_settings import SamplerSettings
+
+Rows = Mapping[str, Tensor]
+"""One window: ``time`` ``(time,)`` [s] and ``usable`` and the measured columns, each ``(vehicle, time)``."""
+
+
+@dataclass(frozen=True)
+class WindowLikelihood:
+    """The likelihood of one window of every vehicle: with a prior it gives a posterior density.
+
+    `n`: usable rows, ``(vehicle,)``. `excited`: ``(vehicle,)`` bool, by the fixed rule. `density`: the posterior
+    density of the vehicles named by an index, from their priors.
+    """
+
+    n: Real[Tensor, " vehicle"]
+    excited: Bool[Tensor, " vehicle"]
+    density: Callable[[Tensor, Prior], Density]
+
+
+class Form(Protocol):
+    """A form of the log density: its columns, its parameters, and the likelihood of a window of rows."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def columns(self) -> tuple[str, ...]: ...
+
+    @property
+    def noise_prior(self) -> Prior: ...
+
+    @property
+    def sampler(self) -> SamplerSettings:
+        """Default settings of the sampler for its posteriors."""
+        ...
+
+    def likelihood(self, rows: Rows, full: float) -> WindowLikelihood:
+        """The likelihood of a window; ``full`` is the number of rows of a complete one."""
+        ...
 
 
 class Estimator(ABC):
@@ -46,13 +92,20 @@ class Estimator(ABC):
         self.kept, self.vehicles, self.device = kept, vehicles, checked_device(device)
         actuation = default_actuation_prior() if actuation_prior is None else actuation_prior
         self.first_prior = Joint(actuation, noise_prior).to(self.device)
-        self.generator = generator_on(self.device, seed)
+        self.generator = torch.Generator(device=self.device).manual_seed(seed)
         self.belief = Belief.of_prior(names, self.first_prior, kept, vehicles, self.generator)
         self._memory: dict[str, Tensor] = {}  # one entry a vehicle
 
     @abstractmethod
     def take(self, rows: Rows, likelihood: WindowLikelihood) -> Belief:
         """Take in one window: its rows, each column ``(vehicle, time)``, and what the form makes of them."""
+
+    def _updated(self, excited: Tensor, learn: Callable[[Tensor], tuple[Summary, Tensor]]) -> Belief:
+        """The belief after a window, of which ``learn`` gives what it makes of the excited vehicles, named by an index:
+        their summary, and where it may be used, ``(vehicle,)`` bool. The others keep their belief."""
+        index = excited.nonzero().squeeze(-1)
+        self.belief = self.belief.updated(excited, index, *learn(index)) if len(index) else self.belief.unused(excited)
+        return self.belief
 
     def _remember(self, index: Tensor, **found: Tensor) -> None:
         """Keep what was found of the vehicles ``index``."""
@@ -75,7 +128,7 @@ class Estimator(ABC):
                 found = f"{str(state.get(key))[:80]} when it was saved, here it is {own.get(key)}"
                 raise InputError(f"state: {key} was {found}")
         shaped_as(own, state, "state")
-        self.belief = self.belief.taken_from(state)
+        self.belief = Belief.of_state(state, self.device)
         self._memory = {name: value.clone().to(self.device) for name, value in state["memory"].items()}
         self.generator.set_state(state["generator"])
 
@@ -92,15 +145,44 @@ class WindowedEstimator(Estimator):
 
     def take(self, rows: Rows, likelihood: WindowLikelihood) -> Belief:
         """Take in one window of every vehicle; those that are not excited keep their belief."""
-        index = likelihood.excited.nonzero().squeeze(-1)
-        if len(index):
+
+        def learn(index: Tensor) -> tuple[Summary, Tensor]:
             excited = {name: rows[name][index] for name in ("usable", *self.form.columns)}
-            found, converged = self._learn({"time": rows["time"], **excited}, index)
-            self.belief = self.belief.updated(likelihood.excited, index, found, converged)
-        else:
-            self.belief = self.belief.unused(likelihood.excited)
-        return self.belief
+            return self._learn({"time": rows["time"], **excited}, index)
+
+        return self._updated(likelihood.excited, learn)
 
     @abstractmethod
     def _learn(self, rows: Rows, index: Tensor) -> tuple[Summary, Tensor]:
         """The summary of the vehicles ``index`` from their rows, and where it may be used, ``(vehicle,)`` bool."""
+
+
+def shaped_as(own: Any, given: Any, place: str) -> None:
+    """Check a saved state against one's own: the same keys, types, dtypes and shapes, and finite numbers throughout.
+
+    What was damaged on its way is found by the checksum of the file that holds it. Raises `InputError` that names the
+    `place` within the state.
+    """
+    if isinstance(own, Tensor):
+        if not isinstance(given, Tensor) or given.dtype != own.dtype or given.shape != own.shape:
+            found = f"{given.dtype} of shape {tuple(given.shape)}" if isinstance(given, Tensor) else _kind(given)
+            raise InputError(f"{place}: found {found}, needs {own.dtype} of shape {tuple(own.shape)}")
+        if own.dtype.is_floating_point and not bool(given.isfinite().all()):
+            raise InputError(f"{place}: holds numbers that are not finite")
+    elif type(given) is not type(own):
+        raise InputError(f"{place}: found {_kind(given)}, needs {_kind(own)}")
+    elif isinstance(own, Mapping):
+        if set(given) != set(own):
+            found, needed = (", ".join(sorted(map(str, x)))[:200] or "nothing" for x in (given, own))
+            raise InputError(f"{place}: found {found}, needs {needed}")
+        for key, value in own.items():
+            shaped_as(value, given[key], f"{place}.{key}")
+    elif isinstance(own, (list, tuple)):
+        if len(given) != len(own):
+            raise InputError(f"{place}: found {len(given)} entries, needs {len(own)}")
+        for i, value in enumerate(own):
+            shaped_as(value, given[i], f"{place}[{i}]")
+
+
+def _kind(x: Any) -> str:
+    return f"a {type(x).__name__}"

@@ -14,6 +14,7 @@ A mode that no chain has reached is searched for by ascents of the density that 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
@@ -24,8 +25,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float, Int
 from avtorch.inference.chains import rhat_of_halves
 from avtorch.inference.coordinates import Coordinates
-from avtorch.inference.density import Density, has_selection, score_of, selected
-from avtorch.inference.exponential_form import matvec
+from avtorch.inference.density import Density, has_selection, matvec, score_of, selected
 from avtorch.inference.importance import RELIABLE, pareto_k
 from avtorch.inference.map import find_mode
 
@@ -65,50 +65,45 @@ MASS = 0.005
 class Exactness:
     """The draws' moments against the exact density's, in the unconstrained coordinates ``z``.
 
+    Three figures a parameter, ``(window, 3, parameter)``: of the mean in SDs, of the SD as a ratio, and of the share
+    beyond TAIL of the draws' SDs as a probability.
+
     Attributes:
         pareto_k: shape of the importance ratios' tail, ``(window,)``; above 0.7 the rest is not reliable.
-        mean_shift: mean of the draws less that of the density, in SDs, ``(window, parameter)``.
-        sd_ratio: SD of the draws over that of the density, ``(window, parameter)``.
-        tail_excess: share of the draws beyond TAIL of their SDs less that of the density, ``(window, parameter)``.
-        mean_error, sd_error, tail_error: their Monte Carlo standard errors from the density's side.
-        draws_mean_error, draws_sd_error, draws_tail_error: the same from the draws' side.
+        off: of the draws less that of the density; of the ratio of SDs, less 1.
+        error: its Monte Carlo standard error from the density's side.
+        draws_error: the same from the draws' side.
         missed: mass of another mode over that at the draws, ``(window,)``; 0 where none was found.
     """
 
     pareto_k: Float[Tensor, " window"]
-    mean_shift: Float[Tensor, "window parameter"]
-    sd_ratio: Float[Tensor, "window parameter"]
-    tail_excess: Float[Tensor, "window parameter"]
-    mean_error: Float[Tensor, "window parameter"]
-    sd_error: Float[Tensor, "window parameter"]
-    tail_error: Float[Tensor, "window parameter"]
-    draws_mean_error: Float[Tensor, "window parameter"]
-    draws_sd_error: Float[Tensor, "window parameter"]
-    draws_tail_error: Float[Tensor, "window parameter"]
+    off: Float[Tensor, "window 3 parameter"]
+    error: Float[Tensor, "window 3 parameter"]
+    draws_error: Float[Tensor, "window 3 parameter"]
     missed: Float[Tensor, " window"]
 
+    def __iter__(self) -> Iterator[Tensor]:
+        return (getattr(self, f.name) for f in fields(self))
+
     def known(self, resolution: float = RESOLUTION) -> Bool[Tensor, " window"]:
-        """Where the density's moments are known well enough to compare with, ``(window,)`` bool."""
-        fine = (self.mean_error <= resolution) & (self.sd_error <= resolution)
-        return fine.all(-1) & (self.pareto_k < RELIABLE)
+        """Where the density's mean and SD are known well enough to compare with, ``(window,)`` bool."""
+        return (self.error[:, :2] <= resolution).flatten(1).all(-1) & (self.pareto_k < RELIABLE)
 
     @cached_property
-    def beyond(self) -> Bool[Tensor, "3 window parameter"]:
-        """Where mean, SD or tail of the draws exceeds tolerance and chance, ``(3, window, parameter)`` bool.
+    def beyond(self) -> Bool[Tensor, "window 3 parameter"]:
+        """Where mean, SD or tail of the draws exceeds tolerance and chance, ``(window, 3, parameter)`` bool.
 
         A standard error of the density's side is allowed in addition.
         """
-        off = torch.stack([self.mean_shift.abs(), (self.sd_ratio - 1).abs(), self.tail_excess.abs()])
-        own_sd = torch.minimum(self.draws_sd_error, HEAVY * self.draws_mean_error)
-        own = torch.stack([self.draws_mean_error, own_sd, self.draws_tail_error])
-        other = torch.stack([self.mean_error, self.sd_error, self.tail_error])
-        tolerance = off.new_tensor([MEAN_TOLERANCE, SD_TOLERANCE, TAIL_TOLERANCE])[:, None, None]
-        return ~(off <= torch.maximum(tolerance, ERRORS * own) + other)
+        mean, sd, tail = self.draws_error.unbind(1)
+        own = torch.stack([mean, torch.minimum(sd, HEAVY * mean), tail], 1)
+        tolerance = self.off.new_tensor([MEAN_TOLERANCE, SD_TOLERANCE, TAIL_TOLERANCE])[:, None]
+        return ~(self.off.abs() <= torch.maximum(tolerance, ERRORS * own) + self.error)
 
     @cached_property
-    def sure(self) -> Bool[Tensor, " window"]:
-        """Where more points would hardly change the answer, ``(window,)`` bool."""
-        return self.known() & (self.pareto_k < CERTAIN) | self.hopeless
+    def within(self) -> Bool[Tensor, " window"]:
+        """Where no figure is beyond tolerance and chance, ``(window,)`` bool."""
+        return ~self.beyond.flatten(1).any(-1)
 
     @cached_property
     def hopeless(self) -> Bool[Tensor, " window"]:
@@ -116,39 +111,41 @@ class Exactness:
         return self.pareto_k > 1.0
 
     @cached_property
+    def sure(self) -> Bool[Tensor, " window"]:
+        """Where more points would hardly change the answer, ``(window,)`` bool."""
+        return self.known() & (self.pareto_k < CERTAIN) | self.hopeless
+
+    @cached_property
     def clear(self) -> Bool[Tensor, " window"]:
         """Where the first test already shows that the draws follow the density, ``(window,)`` bool."""
-        return self.known(2 * RESOLUTION) & (self.pareto_k < CERTAIN) & ~self.beyond.any(0).any(-1)
+        return self.known(2 * RESOLUTION) & (self.pareto_k < CERTAIN) & self.within
 
     @cached_property
     def holds(self) -> Bool[Tensor, " window"]:
         """Where the draws are shown to follow the density, ``(window,)`` bool."""
-        return (self.clear | self.known() & ~self.beyond.any(0).any(-1)) & (self.missed == 0)
+        return (self.clear | self.known() & self.within) & (self.missed == 0)
 
     def why(self, names: tuple[str, ...]) -> list[str]:
         """What is wrong with each window, ``""`` where the draws follow the density."""
-        reasons, holds = [], self.holds
-        if bool(holds.all()):
-            return [""] * len(holds)
-        for w, (known, beyond) in enumerate(zip(self.known().tolist(), self.beyond.movedim(1, 0), strict=True)):
-            if bool(holds[w]):
-                reasons.append("")
-            elif float(self.missed[w]) > 0:
-                mass = f"{float(self.missed[w]):.3g} times the mass at the draws"
-                reasons.append(f"the density has another mode of {mass}, which no chain has reached")
-            elif not known:
-                k = f"Pareto-k {float(self.pareto_k[w]):.2f}, needs {RELIABLE:g} or less"
-                k = k if float(self.pareto_k[w]) >= RELIABLE else "too few effective points"
-                reasons.append(f"importance weights cannot show that the draws follow the density ({k})")
-            else:
-                kind, i = divmod(int(beyond.flatten().int().argmax()), len(names))
-                off = (
-                    f"the mean of {names[i]} is wrong by {float(self.mean_shift[w, i]):+.2f} SDs",
-                    f"the SD of {names[i]} is {float(self.sd_ratio[w, i]):.2f} times the exact one",
-                    f"the tails of {names[i]} hold {float(self.tail_excess[w, i]):+.3f} of probability too much",
-                )[kind]
-                reasons.append(f"the draws do not follow the density: in unconstrained coordinates {off}")
-        return reasons
+        known, holds = self.known().tolist(), self.holds.tolist()
+        return ["" if holds[w] else self._reason(w, known[w], names) for w in range(len(holds))]
+
+    def _reason(self, w: int, known: bool, names: tuple[str, ...]) -> str:
+        if float(self.missed[w]) > 0:
+            mass = f"{float(self.missed[w]):.3g} times the mass at the draws"
+            return f"the density has another mode of {mass}, which no chain has reached"
+        if not known:
+            k = float(self.pareto_k[w])
+            found = f"Pareto-k {k:.2f}, needs {RELIABLE:g} or less" if k >= RELIABLE else "too few effective points"
+            return f"importance weights cannot show that the draws follow the density ({found})"
+        kind, i = divmod(int(self.beyond[w].flatten().int().argmax()), len(names))
+        off = float(self.off[w, kind, i])
+        wrong = (
+            f"the mean of {names[i]} is wrong by {off:+.2f} SDs",
+            f"the SD of {names[i]} is {1 + off:.2f} times the exact one",
+            f"the tails of {names[i]} hold {off:+.3f} of probability too much",
+        )[kind]
+        return f"the draws do not follow the density: in unconstrained coordinates {wrong}"
 
     def put(
         self, index: Int[Tensor, " chosen"], other: Exactness, where: Bool[Tensor, " chosen"] | None = None
@@ -159,15 +156,14 @@ class Exactness:
                 return other
             where = torch.ones_like(index, dtype=torch.bool)
         here, there = index[where], where.nonzero().squeeze(-1)
-        pairs = {f.name: (getattr(self, f.name), getattr(other, f.name)[there]) for f in fields(self)}
-        return Exactness(**{name: mine.index_copy(0, here, theirs) for name, (mine, theirs) in pairs.items()})
+        return Exactness(*(mine.index_copy(0, here, theirs[there]) for mine, theirs in zip(self, other, strict=True)))
 
     @classmethod
     def unknown(cls, z: Float[Tensor, "window parameter"]) -> Exactness:
         """NaN throughout, in the shape of ``z`` ``(window, parameter)``: nothing is known of any window."""
-        each = torch.full_like(z, torch.nan, dtype=torch.float64)
-        window = ("pareto_k", "missed")
-        return cls(**{f.name: (each[:, 0] if f.name in window else each).clone() for f in fields(cls)})
+        window = torch.full_like(z[:, 0], torch.nan, dtype=torch.float64)
+        each = window[:, None, None].expand(-1, 3, z.shape[1])
+        return cls(window, each, each, each, window)
 
 
 def compare_with_exact(density: Density, moments: Moments, total: int) -> Exactness:
@@ -259,29 +255,22 @@ class Moments(NamedTuple):
 
 def weighed(density: Density, moments: Moments, points: int) -> Exactness:
     """Compare draws of these moments with their density: one call of its ``log_prob``, or a few for many windows."""
-    _, mean, lower, share, mean_error, sd_error = moments
+    mean = moments.mean
     base, log_proposal = (x.to(mean.device) for x in proposal(points, mean.shape[-1]))
     size = max(1, (CARD_BLOCK if mean.is_cuda else BLOCK) // points) if has_selection(density) else len(mean)
     parts = torch.arange(len(mean), device=mean.device).split(size)
-    found = [_weighed(selected(density, i), mean[i], lower[i], base, log_proposal) for i in parts]
-    k, m, variance, tail, m_error, v_error, tail_error = map(torch.cat, zip(*found, strict=True))
-    spread = variance.sqrt()
-    # binomial error of the tail's share, for the mean's effective number of independent draws
-    of_tail = (torch.maximum(share, tail) * mean_error.square()).sqrt()
-    errors = (m_error / spread, 0.5 * v_error / variance, tail_error)
-    return Exactness(
-        k, -m / spread, 1 / spread, share - tail, *errors, mean_error, sd_error, of_tail, torch.zeros_like(k)
-    )
+    found = [_weighed(selected(density, i), moments.select(i), base, log_proposal) for i in parts]
+    return Exactness(*map(torch.cat, zip(*found, strict=True)))
 
 
-def _weighed(density: Density, mean: Tensor, lower: Tensor, base: Tensor, log_proposal: Tensor) -> tuple[Tensor, ...]:
-    """Pareto-k; weighted mean, variance and tail's share with their errors, in the draws' SDs about their mean."""
+def _weighed(density: Density, moments: Moments, base: Tensor, log_proposal: Tensor) -> Exactness:
+    _, mean, lower, share, mean_error, sd_error = moments
     away = matvec(lower, base[:, None].expand(-1, len(mean), -1))
     with torch.no_grad():
         log_ratio = log_density(density, away + mean) - log_proposal[:, None]
     log_ratio = log_ratio.masked_fill(~(log_ratio < torch.inf), -torch.inf)
     weight = log_ratio.mT.softmax(-1).nan_to_num()[:, None]
-    # (window, parameter, point), as they are in memory
+    # (window, parameter, point), as they are in memory, in the draws' SDs about their mean
     y = away.permute(1, 2, 0) / lower.square().sum(-1, keepdim=True).sqrt()
     out = (y.abs() > TAIL).to(y)
     m, tail = y @ weight.mT, out @ weight.mT
@@ -290,8 +279,18 @@ def _weighed(density: Density, mean: Tensor, lower: Tensor, base: Tensor, log_pr
     variance = (square @ weight.mT).clamp_min(1e-300)
     # point and mirror image count as one: their errors cancel in part
     pairs = ((weight * x).unflatten(-1, (2, -1)).sum(-2) for x in (off, square - variance, out - tail))
-    errors = (x.square().sum(-1).sqrt() for x in pairs)
-    return pareto_k(log_ratio), *(x.squeeze(-1) for x in (m, variance, tail)), *errors
+    m_error, v_error, tail_error = (x.square().sum(-1).sqrt() for x in pairs)
+    m, tail, variance = m[..., 0], tail[..., 0], variance[..., 0]
+    spread = variance.sqrt()
+    # binomial error of the tail's share, for the mean's effective number of independent draws
+    of_tail = (torch.maximum(share, tail) * mean_error.square()).sqrt()
+    return Exactness(
+        pareto_k(log_ratio),
+        off=torch.stack([-m / spread, 1 / spread - 1, share - tail], 1),
+        error=torch.stack([m_error / spread, 0.5 * v_error / variance, tail_error], 1),
+        draws_error=torch.stack([mean_error, sd_error, of_tail], 1),
+        missed=torch.zeros(len(mean), dtype=mean.dtype, device=mean.device),
+    )
 
 
 def log_density(density: Density, z: Float[Tensor, "point window parameter"]) -> Float[Tensor, "point window"]:

@@ -1,19 +1,28 @@
-"""The log density where jerk is measured (paper, Eq. 4): ``jerk_i ~ Normal(-a_i/T_L + K_L u_i/T_L, sigma^2)``."""
+"""The jerk form: jerk is measured (paper, Eq. 4), ``jerk_i ~ Normal(-a_i/T_L + K_L u_i/T_L, sigma^2)``.
+
+Which windows of a stream are excited is a fixed rule on ``a``, ``u`` and the noise level, never on the posterior.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int, Real
+from avtorch.inference.density import ExponentialForm, PotentialTerms
 from avtorch.inference.device import Device
-from avtorch.inference.exponential_form import ExponentialForm, PotentialTerms
+from avtorch.inference.estimator import Rows, WindowLikelihood
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
+from avtorch.inference.sampler_settings import SamplerSettings
+from avtorch.vehicle.arguments import Batch, Signal
 from avtorch.vehicle.glvd import glvd_jerk
+
+WindowRows: TypeAlias = Real[Tensor, "window time"]
 
 _LOG_2PI = math.log(2 * math.pi)
 
@@ -26,12 +35,7 @@ squared over noise squared, then keeps eight digits, enough for Newton's method 
 
 
 def jerk_log_likelihood(
-    T_L: Float[Tensor, "*#batch"],
-    K_L: Float[Tensor, "*#batch"],
-    sigma: Float[Tensor, "*#batch"],
-    a: Float[Tensor, "*#batch time"],
-    u: Float[Tensor, "*#batch time"],
-    jerk: Float[Tensor, "*#batch time"],
+    T_L: Batch, K_L: Batch, sigma: Batch, a: Signal, u: Signal, jerk: Signal
 ) -> Float[Tensor, "*batch"]:
     """Log likelihood of a window of measured jerk (Eq. 4 with Eq. 1), differentiable in every argument.
 
@@ -62,11 +66,7 @@ class JerkStatistics:
 
     @classmethod
     def from_samples(
-        cls,
-        a: Real[Tensor, "window time"],
-        u: Real[Tensor, "window time"],
-        jerk: Real[Tensor, "window time"],
-        mask: Bool[Tensor, "window time"] | None = None,
+        cls, a: WindowRows, u: WindowRows, jerk: WindowRows, mask: Bool[Tensor, "window time"] | None = None
     ) -> JerkStatistics:
         """Sums over the last dimension of ``a, u, jerk``, each ``(window, time)``, where ``mask`` is true."""
         a, u, jerk = (torch.as_tensor(x, dtype=torch.float64) for x in (a, u, jerk))
@@ -178,13 +178,7 @@ class JerkPoints(JerkDensity):
         [0.5, 0.9, 0.1]
     """
 
-    def __init__(
-        self,
-        a: Real[Tensor, "window time"],
-        u: Real[Tensor, "window time"],
-        jerk: Real[Tensor, "window time"],
-        prior: Prior | None = None,
-    ) -> None:
+    def __init__(self, a: WindowRows, u: WindowRows, jerk: WindowRows, prior: Prior | None = None) -> None:
         """``a, u, jerk``: shape ``(window, time)``, units as in :func:`jerk_log_likelihood`."""
         super().__init__(JerkStatistics.from_samples(a, u, jerk), prior)
         self._columns = torch.stack([jerk, a, u], -1).to(torch.float64)
@@ -204,3 +198,68 @@ class JerkPoints(JerkDensity):
         jerk, a, u = self._columns[:, index].unbind(-1)
         T, K, sigma = z.exp().unbind(-1)
         return self.prior.log_prob(z) + self.points / len(index) * jerk_log_likelihood(T, K, sigma, a, u, jerk)
+
+
+@dataclass(frozen=True)
+class ExcitationRule:
+    """A window is excited if it alone would resolve the accepted change at a fixed reference vehicle.
+
+    Least squares of jerk on ``(-a, u)`` predicts the standard deviations of ``1/T_L`` and ``K_L/T_L`` from the products
+    of ``a`` and ``u`` and the noise level; at the reference they become those of ``T_L`` and ``K_L``. A window whose
+    prediction is wider hardly changes the prior and would only dilute the belief. The rule does not depend on the
+    vehicle: for one much quicker than the reference (a lag of 0.05 s, say) it excludes some windows that would resolve
+    it.
+
+    `T_ref`, `K_ref`: reference lag [s] and gain [-], slow enough that a degraded vehicle is resolved, too. `sd_T`,
+    `sd_K`: the widest predicted SDs of ``T_L`` [s] and ``K_L`` [-]: the paper's accepted changes. `share`: the least
+    share of the window's rows that must be usable.
+    """
+
+    T_ref: float = 1.0
+    K_ref: float = 1.0
+    sd_T: float = 0.2
+    sd_K: float = 0.15
+    share: float = 0.5
+
+    def predicted_sd(self, statistics: JerkStatistics) -> tuple[Float[Tensor, " window"], Float[Tensor, " window"]]:
+        """Predicted SDs of ``T_L`` [s] and ``K_L`` [-] at the reference vehicle, each ``(window,)``.
+
+        Infinite where ``a`` and ``u`` are constant zero or collinear.
+        """
+        s = statistics
+        _, _, noise = s.least_squares()
+        determinant = s.aa * s.uu - s.au.square()
+        solvable = determinant > 1e-12 * s.aa * s.uu
+        inverse = noise.square() / torch.where(solvable, determinant, 1.0)
+        var_inverse_lag, var_gain, cov = inverse * s.uu, inverse * s.aa, inverse * s.au
+        # delta method: T = 1/x, K = y/x with x = 1/T_L, y = K_L/T_L
+        sd_T = self.T_ref**2 * var_inverse_lag.sqrt()
+        var_K = self.T_ref**2 * (var_gain - 2 * self.K_ref * cov + self.K_ref**2 * var_inverse_lag)
+        sd_K = var_K.clamp_min(0.0).sqrt()
+        return torch.where(solvable, sd_T, torch.inf), torch.where(solvable, sd_K, torch.inf)
+
+    def __call__(self, statistics: JerkStatistics, rows: float) -> Bool[Tensor, " window"]:
+        """Excited or not, ``(window,)`` bool; ``rows`` is how many rows a full window has."""
+        sd_T, sd_K = self.predicted_sd(statistics)
+        return (sd_T <= self.sd_T) & (sd_K <= self.sd_K) & (statistics.n >= max(4.0, self.share * rows))
+
+
+class JerkForm:
+    """Jerk is measured: Eq. 4 of the paper from six sums."""
+
+    names = ("T_L", "K_L", "sigma")
+    columns = ("accel_cmd", "accel", "jerk")
+    sampler = SamplerSettings()
+
+    def __init__(self, *, rule: ExcitationRule | None = None, noise_prior: Prior | None = None) -> None:
+        self.rule = ExcitationRule() if rule is None else rule
+        self.noise_prior = default_jerk_noise_prior() if noise_prior is None else noise_prior
+
+    def likelihood(self, rows: Rows, full: float) -> WindowLikelihood:
+        statistics = JerkStatistics.from_samples(rows["accel"], rows["accel_cmd"], rows["jerk"], rows["usable"])
+        statistics = statistics.with_least_noise()
+        return WindowLikelihood(
+            n=statistics.n,
+            excited=self.rule(statistics, full),
+            density=lambda index, prior: JerkDensity(statistics.select(index), prior),
+        )

@@ -1,7 +1,7 @@
 """The SGLD walk as a compiled loop (numba).
 
 What a step does is that of :class:`~avtorch.inference.sgld.SGLD`; the density is an
-:class:`~avtorch.inference.exponential_form.ExponentialForm`. A chain's noise is a function of seed, window, chain and
+:class:`~avtorch.inference.density.ExponentialForm`. A chain's noise is a function of seed, window, chain and
 step alone (Philox 4x32-10; Salmon et al. 2011), so it depends neither on the number of threads nor on that of chains.
 
 Everything compiled stands in this file: numba's cache on disk is renewed when the file changes, and only then. Nothing
@@ -55,19 +55,8 @@ def exp(x):
     n = shifted - _ROUND
     r = x - n * _LN2_HIGH - n * _LN2_LOW
     p = _INVERSE_FACTORIALS[13]
-    p = p * r + _INVERSE_FACTORIALS[12]
-    p = p * r + _INVERSE_FACTORIALS[11]
-    p = p * r + _INVERSE_FACTORIALS[10]
-    p = p * r + _INVERSE_FACTORIALS[9]
-    p = p * r + _INVERSE_FACTORIALS[8]
-    p = p * r + _INVERSE_FACTORIALS[7]
-    p = p * r + _INVERSE_FACTORIALS[6]
-    p = p * r + _INVERSE_FACTORIALS[5]
-    p = p * r + _INVERSE_FACTORIALS[4]
-    p = p * r + _INVERSE_FACTORIALS[3]
-    p = p * r + 0.5
-    p = p * r + 1.0
-    p = p * r + 1.0
+    for k in range(12, -1, -1):
+        p = p * r + _INVERSE_FACTORIALS[k]
     return p * _from_bits((_bits(shifted) + 1023) << 52)
 
 
@@ -88,27 +77,12 @@ def _next_key(k0, k1):
 @njit(**_INLINE)
 def philox(c0, c1, c2, c3, k0, k1):
     """Philox 4x32-10: four random words of 32 bits from a counter of four and a key of two, all held as uint64."""
-    # with the upper halves known to be empty the compiler takes several counters at once; so it does without a loop
+    # with the upper halves known to be empty the compiler takes several counters at once
     low = np.uint64(0xFFFFFFFF)
     c0, c1, c2, c3, k0, k1 = c0 & low, c1 & low, c2 & low, c3 & low, k0 & low, k1 & low
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = _next_key(k0, k1)
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = _next_key(k0, k1)
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = _next_key(k0, k1)
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = _next_key(k0, k1)
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = _next_key(k0, k1)
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = _next_key(k0, k1)
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = _next_key(k0, k1)
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = _next_key(k0, k1)
-    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-    k0, k1 = _next_key(k0, k1)
+    for _ in range(9):
+        c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
+        k0, k1 = _next_key(k0, k1)
     return _round(c0, c1, c2, c3, k0, k1)
 
 

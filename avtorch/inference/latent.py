@@ -17,7 +17,7 @@ from avtorch.arrays import Bool, Float, Int, Real
 from avtorch.errors import InputError
 from avtorch.inference.compiled import load_kernels
 from avtorch.inference.device import Device
-from avtorch.inference.form import Rows, WindowLikelihood
+from avtorch.inference.estimator import Rows, WindowLikelihood
 from avtorch.inference.latent_model import ACCEL_SD0, SPEED_SD0, latent_log_likelihood
 from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior
 from avtorch.inference.sampler_settings import SamplerSettings
@@ -114,7 +114,7 @@ class LatentWindow:
 
         After a gap, a standstill or a driver's override the acceleration is unknown, so each run starts afresh.
         """
-        pieces: list[LatentWindow] = []
+        pieces: list[Tensor] = []
         owner: list[int] = []
         for w in range(self.windows):
             rows = self.mask[w].nonzero()[:, 0]
@@ -123,19 +123,15 @@ class LatentWindow:
             step = self.time[w, rows].diff()
             usual = step.median() if len(step) else torch.tensor(0.0)
             cut = ((rows.diff() > 1) | (step > GAP * usual)).nonzero()[:, 0] + 1
-            for piece in torch.tensor_split(rows, cut.cpu()):
-                pieces.append(
-                    LatentWindow.single(
-                        self.time[w, piece],
-                        self.u[w, piece],
-                        accel=None if self.accel is None else self.accel[w, piece],
-                        speed=None if self.speed is None else self.speed[w, piece],
-                    )
-                )
-                owner.append(w)
+            found = torch.tensor_split(rows, cut.cpu())
+            pieces += found
+            owner += [w] * len(found)
         if not pieces:
             raise InputError("mask: no row of any window may be used")
-        return LatentWindow.stack(pieces), torch.tensor(owner, device=self.time.device)
+        of = torch.tensor(owner, device=self.time.device)
+        rows = torch.nn.utils.rnn.pad_sequence(pieces, batch_first=True)
+        mask = torch.nn.utils.rnn.pad_sequence([torch.ones_like(x, dtype=torch.bool) for x in pieces], batch_first=True)
+        return self._each(lambda x: torch.where(mask, x[of[:, None], rows], x.new_zeros(()))), of
 
 
 #: Rows count as even while their times are this close to an even grid: a quarter of a step, and 2.5 ms. The error in

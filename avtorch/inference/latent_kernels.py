@@ -32,6 +32,10 @@ _C_C, _C_E, _E_C, _E_E, _CC, _CE, _EE = 7, 8, 9, 10, 11, 12, 13
 _STEP = 14
 # and those of the belief: mean, then the covariance's upper triangle
 _BELIEF = 14
+# the same, LANES apart, for a state in the order (v, a, c, e) and (a, v, e, c): speed and acceleration are what is
+# measured of the first and the third
+_SPEED_FIRST = tuple(LANES * i for i in (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13))
+_ACCEL_FIRST = tuple(LANES * i for i in (1, 0, 3, 2, 8, 5, 10, 9, 4, 7, 6, 13, 12, 11))
 
 
 @njit(**_OPTIONS)
@@ -142,61 +146,34 @@ def _predict(b, step, command):
 
 
 @njit(**_OPTIONS)
-def _see_speed(b, total, product, R, speed):
+def _see(b, total, product, R, seen, order):
+    """Takes in ``seen``, the sum of the first and the third number of the belief in this ``order``."""
+    one, two, three, four, aa, ab, ac, ad, bb, bc, bd, cc, cd, dd = order
+    turned = two < one  # products are taken in one order, of which the last digit depends
     for c in range(LANES):
-        vv, va, vc, ve = b[4 * LANES + c], b[5 * LANES + c], b[6 * LANES + c], b[7 * LANES + c]
-        ac, cc, ce = b[9 * LANES + c], b[11 * LANES + c], b[12 * LANES + c]
-        sv, sa, sc, se = vv + vc, va + ac, vc + cc, ve + ce
-        S = sv + sc + R[c]
+        s1, s2 = b[aa + c] + b[ac + c], b[ab + c] + b[bc + c]
+        s3, s4 = b[ac + c] + b[cc + c], b[ad + c] + b[cd + c]
+        S = s1 + s3 + R[c]
         S = S if S > 0.0 else np.nan
         w = 1.0 / S
-        missed = speed - b[c] - b[2 * LANES + c]
+        missed = seen - b[one + c] - b[three + c]
         total[c] += missed * missed * w
         product[c] *= S
-        kv, ka, kc, ke = w * sv, w * sa, w * sc, w * se
-        b[c] += kv * missed
-        b[LANES + c] += ka * missed
-        b[2 * LANES + c] += kc * missed
-        b[3 * LANES + c] += ke * missed
-        b[4 * LANES + c] = vv - kv * sv
-        b[5 * LANES + c] = va - kv * sa
-        b[6 * LANES + c] = vc - kv * sc
-        b[7 * LANES + c] = ve - kv * se
-        b[8 * LANES + c] -= ka * sa
-        b[9 * LANES + c] = ac - ka * sc
-        b[10 * LANES + c] -= ka * se
-        b[11 * LANES + c] = cc - kc * sc
-        b[12 * LANES + c] = ce - kc * se
-        b[13 * LANES + c] -= ke * se
-
-
-@njit(**_OPTIONS)
-def _see_accel(b, total, product, R, accel):
-    for c in range(LANES):
-        va, ve, aa = b[5 * LANES + c], b[7 * LANES + c], b[8 * LANES + c]
-        ac, ae, ce, ee = b[9 * LANES + c], b[10 * LANES + c], b[12 * LANES + c], b[13 * LANES + c]
-        sv, sa, sc, se = va + ve, aa + ae, ac + ce, ae + ee
-        S = sa + se + R[c]
-        S = S if S > 0.0 else np.nan
-        w = 1.0 / S
-        missed = accel - b[LANES + c] - b[3 * LANES + c]
-        total[c] += missed * missed * w
-        product[c] *= S
-        kv, ka, kc, ke = w * sv, w * sa, w * sc, w * se
-        b[c] += kv * missed
-        b[LANES + c] += ka * missed
-        b[2 * LANES + c] += kc * missed
-        b[3 * LANES + c] += ke * missed
-        b[4 * LANES + c] -= kv * sv
-        b[5 * LANES + c] = va - kv * sa
-        b[6 * LANES + c] -= kv * sc
-        b[7 * LANES + c] = ve - kv * se
-        b[8 * LANES + c] = aa - ka * sa
-        b[9 * LANES + c] = ac - ka * sc
-        b[10 * LANES + c] = ae - ka * se
-        b[11 * LANES + c] -= kc * sc
-        b[12 * LANES + c] = ce - kc * se
-        b[13 * LANES + c] = ee - ke * se
+        k1, k2, k3, k4 = w * s1, w * s2, w * s3, w * s4
+        b[one + c] += k1 * missed
+        b[two + c] += k2 * missed
+        b[three + c] += k3 * missed
+        b[four + c] += k4 * missed
+        b[aa + c] -= k1 * s1
+        b[ab + c] -= k2 * s1 if turned else k1 * s2
+        b[ac + c] -= k1 * s3
+        b[ad + c] -= k1 * s4
+        b[bb + c] -= k2 * s2
+        b[bc + c] -= k2 * s3
+        b[bd + c] -= k2 * s4
+        b[cc + c] -= k3 * s3
+        b[cd + c] -= k4 * s3 if turned else k3 * s4
+        b[dd + c] -= k4 * s4
 
 
 @njit(
@@ -234,9 +211,9 @@ def filtered(out, p, variances, speed_sd, accel_sd, steps, even, u, speed, accel
                 _discretise(step, p, first, steps[k - 1])
             _predict(b, step, u[k - 1])
             if has_speed:
-                _see_speed(b, total, product, R[0], speed[k])
+                _see(b, total, product, R[0], speed[k], _SPEED_FIRST)
             if has_accel:
-                _see_accel(b, total, product, R[1], accel[k])
+                _see(b, total, product, R[1], accel[k], _ACCEL_FIRST)
             if k % TOGETHER == 0:
                 for c in range(LANES):
                     total[c] += math.log(product[c])

@@ -29,6 +29,7 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
+from avtorch.vehicle.arguments import Batch, Signal
 
 #: Prior standard deviation of the first speed about the first measured one [m/s]: practically diffuse.
 SPEED_SD0 = 10.0
@@ -85,13 +86,7 @@ def _ou(time: Tensor, density: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tens
 
 
 def discretise(
-    T_L: Float[Tensor, "*#batch"],
-    K_L: Float[Tensor, "*#batch"],
-    process_noise: Float[Tensor, "*#batch"],
-    road_noise: Float[Tensor, "*#batch"],
-    coloured_sd: Float[Tensor, "*#batch"],
-    coloured_time: Float[Tensor, "*#batch"],
-    dt: Float[Tensor, "*#batch"],
+    T_L: Batch, K_L: Batch, process_noise: Batch, road_noise: Batch, coloured_sd: Batch, coloured_time: Batch, dt: Batch
 ) -> Step:
     """Exact discretisation with the command held over ``dt``; all arguments broadcast to ``(...)``.
 
@@ -158,19 +153,19 @@ def _tensor(value: Tensor | float, like: Tensor) -> Tensor:
 
 
 def latent_log_likelihood(
-    T_L: float | Float[Tensor, "*#batch"],
-    K_L: float | Float[Tensor, "*#batch"],
-    process_noise: float | Float[Tensor, "*#batch"],
-    coloured_sd: float | Float[Tensor, "*#batch"],
-    coloured_time: float | Float[Tensor, "*#batch"],
-    time: Float[Tensor, "*#batch time"],
-    u: Float[Tensor, "*#batch time"],
+    T_L: float | Batch,
+    K_L: float | Batch,
+    process_noise: float | Batch,
+    coloured_sd: float | Batch,
+    coloured_time: float | Batch,
+    time: Signal,
+    u: Signal,
     *,
-    accel: Float[Tensor, "*#batch time"] | None = None,
-    speed: Float[Tensor, "*#batch time"] | None = None,
-    accel_noise: float | Float[Tensor, "*#batch"] | None = None,
-    speed_noise: float | Float[Tensor, "*#batch"] | None = None,
-    road_noise: float | Float[Tensor, "*#batch"] = 0.0,
+    accel: Signal | None = None,
+    speed: Signal | None = None,
+    accel_noise: float | Batch | None = None,
+    speed_noise: float | Batch | None = None,
+    road_noise: float | Batch = 0.0,
     mask: Bool[Tensor, "*#batch time"] | None = None,
 ) -> Float[Tensor, "*batch"]:
     """Log likelihood ``(...)`` [nats] of measured acceleration and/or speed, by Kalman innovations.
@@ -186,8 +181,7 @@ def latent_log_likelihood(
     ``accel`` and ``speed``. The start is that of `initial_covariance`; the first speed's prior is centred on the first
     unmasked measured one, and the centre moves with the data: a constant added to all speeds changes nothing.
 
-    Raises `InputError` where neither signal, or a signal without its
-    noise, is given.
+    Raises `InputError` where neither signal, or a signal without its noise, is given.
     """
     if accel is None and speed is None:
         raise InputError("accel, speed: neither was given; the latent form needs at least one measured signal")

@@ -1,6 +1,6 @@
 r"""The posterior's mode (paper, Eq. 4) and its curvature there, for all windows at once, by Newton's method.
 
-For potentials of exponential form (:mod:`avtorch.inference.exponential_form`) gradient and Hessian are in closed form,
+For potentials of exponential form (:mod:`avtorch.inference.density`) gradient and Hessian are in closed form,
 
 .. math::
     \nabla U = l + Q (z - m) + E^\top (e \circ C e) + a e^z + s e^{2z}, \qquad
@@ -21,8 +21,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, BoolArray, Float, FloatArray, Int
-from avtorch.inference.density import Density, has_quick_values, score_of
-from avtorch.inference.exponential_form import ExponentialForm, has_form
+from avtorch.inference.density import Density, ExponentialForm, exponential_form, score_of
 
 Expansion = tuple[FloatArray, FloatArray, FloatArray]
 """Potential ``(window,)``, gradient ``(window, d)`` and Hessian ``(window, d, d)``."""
@@ -102,8 +101,8 @@ def find_mode(
         True
     """
     begin = (density.initial() if start is None else start).detach()
-
-    by_values = from_values or has_quick_values(density)
+    by_values = from_values or getattr(density, "quick_values", False)
+    form = None if by_values else exponential_form(density)
 
     def by_differences(z: FloatArray) -> Expansion:
         place = torch.from_numpy(z).to(begin)
@@ -111,7 +110,7 @@ def find_mode(
         potential, gradient, hessian = (x.detach().double().cpu().numpy() for x in found)
         return _finite(potential, gradient, hessian)
 
-    expand = _of_form(density.exponential_form) if has_form(density) and not by_values else by_differences
+    expand = by_differences if form is None else _of_form(form)
     z, (potential, gradient, hessian) = _ascend(expand, begin.double().cpu().numpy(), iterations, tolerance)
     eigenvalues, basis = np.linalg.eigh(hessian)
     curvature = np.maximum(np.abs(eigenvalues), FLAT)

@@ -152,7 +152,6 @@ def nuts(
     draws: int = 1000,
     warmup: int = 500,
     seed: int = 0,
-    target_accept: float = 0.8,
     rhat_max: float = 1.1,
 ) -> Posterior:
     """Full-batch NUTS with a dense mass matrix over one window of a density, by Pyro.
@@ -174,7 +173,7 @@ def nuts(
         torch.manual_seed(seed)
         for _ in range(chains):
             start = {"z": mode.z[0] + mode.scale[0] @ torch.randn_like(mode.z[0])}
-            kernel = NUTS(full_mass=True, target_accept_prob=target_accept, potential_fn=potential)
+            kernel = NUTS(full_mass=True, potential_fn=potential)
             run = MCMC(kernel, draws, warmup, initial_params=start, disable_progbar=True)
             run.run()
             walked.append(run.get_samples()["z"])

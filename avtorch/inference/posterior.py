@@ -11,7 +11,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
-from avtorch.inference.arviz_export import UNITS, inference_data, parameter_table
+from avtorch.inference.arviz_export import UNITS, draws_frame, inference_data, parameter_table
 from avtorch.inference.chains import effective_sample_size, nested_rhat, normal_scores, quantiles_of
 from avtorch.inference.exactness import Exactness
 
@@ -65,10 +65,7 @@ class Posterior(Displayed):
 
     def to_dataframe(self) -> pandas.DataFrame:
         """The draws, a row a chain, draw and window, a column a parameter. Needs ``pip install 'avtorch[pandas]'``."""
-        chains, draws, windows, _ = self.draws.shape
-        place = torch.cartesian_prod(torch.arange(chains), torch.arange(draws), torch.arange(windows)).reshape(-1, 3)
-        index = {dim: place[:, i].numpy() for i, dim in enumerate(("chain", "draw", "window"))}
-        return Frame(index | {name: self[name].flatten().cpu().numpy() for name in self.names}).to_dataframe()
+        return draws_frame(self.names, self.draws, ("chain", "draw", "window")).to_dataframe()
 
     def to_arviz(self, *, window: int | None = None) -> InferenceData:
         """The draws as ``arviz.InferenceData``: one variable a parameter, with its unit in ``attrs["units"]``.

@@ -9,17 +9,19 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
 import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
-from avtorch.inference.exponential_form import PotentialTerms
+from avtorch.inference.density import PotentialTerms
 from avtorch.vehicle.arguments import broadcast_shape
 
 _LOG_2PI = math.log(2 * math.pi)
+
+Draws: TypeAlias = Float[Tensor, "count window parameter"]
 
 
 @dataclass(frozen=True)
@@ -31,9 +33,7 @@ class Prior(ABC):
         """Minus its log density, of so many windows."""
 
     @abstractmethod
-    def sample(
-        self, count: int, windows: int, *, generator: torch.Generator | None = None
-    ) -> Float[Tensor, "count window parameter"]:
+    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Draws:
         """Draws of ``z``, shape ``(count, window, parameter)``."""
 
     @abstractmethod
@@ -82,9 +82,7 @@ class LogNormalPrior(Prior):
         constant = self.log_sd.log().sum() + 0.5 * d * _LOG_2PI
         return PotentialTerms.of(windows, d, constant=constant, center=self.median.log(), quadratic=precision.diag())
 
-    def sample(
-        self, count: int, windows: int, *, generator: torch.Generator | None = None
-    ) -> Float[Tensor, "count window parameter"]:
+    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Draws:
         noise = torch.randn(count, windows, len(self.median), generator=generator, **_like(self.median))
         return self.median.log() + self.log_sd * noise
 
@@ -106,9 +104,7 @@ class HalfNormalPrior(Prior):
         constant = self.scale.log().sum() - 0.5 * d * math.log(2 / math.pi)
         return PotentialTerms.of(windows, d, constant=constant, linear=-1.0, own_square=square)
 
-    def sample(
-        self, count: int, windows: int, *, generator: torch.Generator | None = None
-    ) -> Float[Tensor, "count window parameter"]:
+    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Draws:
         noise = torch.randn(count, windows, len(self.scale), generator=generator, **_like(self.scale))
         return (self.scale * noise.abs()).log()
 
@@ -144,9 +140,7 @@ class QuadrantNormal(Prior):
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> QuadrantNormal:
         return QuadrantNormal(self.mean[index], self.variance)
 
-    def sample(
-        self, count: int, windows: int, *, generator: torch.Generator | None = None
-    ) -> Float[Tensor, "count window parameter"]:
+    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Draws:
         # inverse CDF of the part above zero: exact, with a fixed number of uniforms
         uniform = torch.rand(count, windows, self.mean.shape[-1], generator=generator, **_like(self.mean))
         sd = math.sqrt(self.variance)
@@ -177,9 +171,7 @@ class LogSpaceNormal(Prior):
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> LogSpaceNormal:
         return LogSpaceNormal(self.mean_z[index], self.cov_z[index])
 
-    def sample(
-        self, count: int, windows: int, *, generator: torch.Generator | None = None
-    ) -> Float[Tensor, "count window parameter"]:
+    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Draws:
         noise = torch.randn(count, windows, self.mean_z.shape[-1], generator=generator, **_like(self.mean_z))
         return self.mean_z + torch.einsum("wij,cwj->cwi", torch.linalg.cholesky(self.cov_z), noise)
 
@@ -200,9 +192,7 @@ class Joint(Prior):
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Joint:
         return Joint(self.actuation.select(index), self.noise.select(index))
 
-    def sample(
-        self, count: int, windows: int, *, generator: torch.Generator | None = None
-    ) -> Float[Tensor, "count window parameter"]:
+    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Draws:
         parts = [part.sample(count, windows, generator=generator) for part in (self.actuation, self.noise)]
         return torch.cat(parts, dim=-1)
 
@@ -230,9 +220,7 @@ class Switch(Prior):
             return later
         return Switch(started, first, later) if bool(started.any()) else first
 
-    def sample(
-        self, count: int, windows: int, *, generator: torch.Generator | None = None
-    ) -> Float[Tensor, "count window parameter"]:
+    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Draws:
         first = self.first.sample(count, windows, generator=generator)
         later = self.later.sample(count, windows, generator=generator)
         return torch.where(self.started[:, None], later, first)

@@ -1,32 +1,44 @@
-"""The loop over windows: each window's posterior is the next one's prior (paper, Sec. 3.2.3), batched over vehicles."""
+"""The loop over windows: each window's posterior is the next one's prior (paper, Sec. 3.2.3), batched over vehicles.
+
+The posterior of each window is SGLD's; or, of the same density, the mode with its curvature, or weighted draws.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Bool
+from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief, Summary
 from avtorch.inference.chains import quantiles_of
-from avtorch.inference.density import Density
-from avtorch.inference.estimator import Estimator
-from avtorch.inference.form import Rows, WindowLikelihood
-from avtorch.inference.priors import (
-    Joint,
-    LogSpaceNormal,
-    Prior,
-    QuadrantNormal,
-    Switch,
-    default_jerk_noise_prior,
-)
+from avtorch.inference.density import Density, SelectableDensity
+from avtorch.inference.estimator import Estimator, Rows, WindowLikelihood
+from avtorch.inference.importance import ImportanceSettings, WeightedDraws, weighted_draws
+from avtorch.inference.map import Mode, find_mode
+from avtorch.inference.priors import Joint, LogSpaceNormal, Prior, QuadrantNormal, Switch, default_jerk_noise_prior
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings
 
 CarriedBy = Literal["lambda", "posterior", "forgetting"]
+
+
+class Solved(NamedTuple):
+    """The posterior of some vehicles: summary, log moments, and where it converged ``(vehicle,)`` bool."""
+
+    summary: Summary
+    mean_z: Float[Tensor, "vehicle parameter"]
+    cov_z: Float[Tensor, "vehicle parameter parameter"]
+    converged: Bool[Tensor, " vehicle"]
+
+    def put(self, index: Int[Tensor, " some"], other: Solved) -> Solved:
+        """The vehicles ``index`` taken from ``other``."""
+        rest = (mine.index_copy(0, index, theirs) for mine, theirs in zip(self[1:], other[1:], strict=True))
+        return Solved(self.summary.put(index, other.summary), *rest)
 
 
 class SequentialInference(Estimator):
@@ -109,34 +121,111 @@ class SequentialInference(Estimator):
         `density`: builds the posterior density of the vehicles named by an index from their priors. `excited`:
         ``(vehicle,)`` bool; the others keep their belief.
         """
-        excited = excited.to(self.device)
-        index = excited.nonzero().squeeze(-1)
-        if not len(index):
-            self.belief = self.belief.unused(excited)
-            return self.belief
-        found, mean_z, cov_z, converged = self._solve(density(index, self.prior().select(index)))
-        started = torch.ones_like(converged)[converged]
-        self._remember(index[converged], mean_z=mean_z[converged], cov_z=cov_z[converged], started=started)
-        self.belief = self.belief.updated(excited, index, found, converged)
-        return self.belief
+
+        def learn(index: Tensor) -> tuple[Summary, Tensor]:
+            summary, mean_z, cov_z, good = self._solve(density(index, self.prior().select(index)))
+            started = torch.ones_like(good)[good]
+            self._remember(index[good], mean_z=mean_z[good], cov_z=cov_z[good], started=started)
+            return summary, good
+
+        return self._updated(excited.to(self.device), learn)
 
     def take(self, rows: Rows, likelihood: WindowLikelihood) -> Belief:
         """:meth:`update` with the interface of an estimator of a stream; the likelihood contains all that is needed of
         the rows."""
         return self.update(likelihood.density, likelihood.excited)
 
-    def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
-        """Posterior of some vehicles: its summary, log moments, and where it converged ``(vehicle,)`` bool."""
+    def _solve(self, density: Density) -> Solved:
+        """The posterior of some vehicles."""
         posterior = sample(density, self.settings, generator=self.generator)
-        q05, q95 = quantiles_of(posterior.flat, 0.05, 0.95)
-        draws = _thin(posterior.flat, self.kept)
-        summary = Summary(posterior.mean, posterior.sd, q05, q95, draws)
-        return summary, *posterior.log_moments(), posterior.converged
+        flat = posterior.flat
+        q05, q95 = quantiles_of(flat, 0.05, 0.95)
+        # spread evenly over the draws, repeated where there are fewer
+        kept = torch.linspace(0, len(flat) - 1, self.kept, dtype=torch.float64, device=flat.device).round().long()
+        summary = Summary(posterior.mean, posterior.sd, q05, q95, flat[kept])
+        return Solved(summary, *posterior.log_moments(), posterior.converged)
 
     def state_dict(self) -> dict[str, Any]:
         return {"mode": self.mode, **super().state_dict()}
 
 
-def _thin(draws: Tensor, count: int) -> Tensor:
-    """``count`` draws spread evenly over the first dimension (repeated where there are fewer)."""
-    return draws[torch.linspace(0, len(draws) - 1, count, dtype=torch.float64, device=draws.device).round().long()]
+WIDEST = 3.0
+"""SD of a logarithm, twice the widest prior's, above which the curvature at the mode does not describe the
+posterior."""
+
+
+class MaximumAPosteriori(SequentialInference):
+    """The same windows, densities and priors as SGLD's loop; each posterior is replaced by a normal in the log space.
+
+    Its mean is the mode and its covariance the inverse curvature there (Laplace), so that the belief's median is the
+    mode and its draws are log-normal. Exact where the log posterior is quadratic; the long tail of a skewed one is
+    lost.
+
+    Takes the arguments of :class:`SequentialInference`; ``settings`` do not apply.
+    """
+
+    def _solve(self, density: Density) -> Solved:
+        mode = find_mode(density)
+        converged = mode.converged & (mode.covariance.diagonal(dim1=-2, dim2=-1).amax(-1) < WIDEST**2)
+        # the others are not used; any finite covariance will do
+        covariance = torch.where(
+            converged[:, None, None],
+            mode.covariance,
+            torch.eye(mode.z.shape[-1], dtype=mode.z.dtype, device=mode.z.device),
+        )
+        summary = Summary.log_normal(mode.z, covariance, self.kept, self.generator)
+        return Solved(summary, mode.z, covariance, converged)
+
+
+AGAINST_SGLD = (
+    "Importance sampling in place of SGLD, whose gradients are dear here: on 24 windows its means lay within 0.08 SD "
+    "of a long reference in 95 %, SGLD's within 0.18."
+)
+"""The estimator's error beside SGLD's, for answers; `benchmarks/estimators.md` has the table."""
+
+FIRST = ImportanceSettings()
+WIDER = ImportanceSettings(draws=512, rounds=8, degrees=3, width=1.3)
+"""Tried where the first draws' weights are not reliable: heavier and wider proposals, up to twice as many draws."""
+MANY = ImportanceSettings(draws=4096, rounds=8, enough=1000.0, degrees=3, width=1.3)
+"""Tried where those are not reliable either: up to eight times as many, for a fifth of the time of SGLD's chains,
+and far less than that where rows are uneven."""
+
+
+class ImportanceSampling(SequentialInference):
+    """The same windows, densities and priors as SGLD's loop; each posterior by weighted draws (`weighted_draws`).
+
+    A window whose weights are not reliable is drawn again, from wider proposals and then from many. Where they are not
+    reliable either, it is sampled by SGLD, with ``settings``.
+
+    Takes the arguments of :class:`SequentialInference`.
+    """
+
+    def _solve(self, density: Density) -> Solved:
+        # proposals need no better mode: it is within a hundredth of an SD
+        mode = find_mode(density, from_values=True, tolerance=5e-5)
+        found = self._drawn(density, mode, FIRST)
+        for attempt in (partial(self._drawn, settings=WIDER), partial(self._drawn, settings=MANY), self._chains):
+            again = (~found.converged).nonzero().squeeze(-1)
+            if not len(again):
+                break
+            if len(again) == density.windows:
+                found = attempt(density, mode)
+            elif isinstance(density, SelectableDensity):
+                found = found.put(again, attempt(density.select(again), mode.select(again)))
+        return found
+
+    def _drawn(self, density: Density, mode: Mode, settings: ImportanceSettings) -> Solved:
+        draws = weighted_draws(density, settings, generator=self.generator, mode=mode)
+        summary = _summary(draws, self.kept, self.generator)
+        return Solved(summary, *draws.moments(), mode.converged & draws.converged(settings))
+
+    def _chains(self, density: Density, mode: Mode) -> Solved:
+        return super()._solve(density)
+
+
+def _summary(draws: WeightedDraws, kept: int, generator: torch.Generator) -> Summary:
+    value, weight = draws.z.exp(), draws.weight[..., None]
+    mean = (weight * value).sum(0)
+    sd = (weight * (value - mean).square()).sum(0).sqrt()
+    low, high = draws.quantile(0.05).exp(), draws.quantile(0.95).exp()
+    return Summary(mean, sd, low, high, draws.equal(kept, generator).exp())

@@ -19,8 +19,9 @@ from avtorch.display import Card, Displayed
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief
 from avtorch.inference.device import Device, checked_device
+from avtorch.inference.estimator import Form
 from avtorch.inference.estimators import make_estimator
-from avtorch.inference.form import Form, JerkForm
+from avtorch.inference.jerk import JerkForm
 from avtorch.inference.stream_units import StreamUnits
 from avtorch.io import Damaged
 from avtorch.io.clock import ROUNDING_S, decimals
@@ -51,6 +52,7 @@ def unpacked(content: bytes, path: Path, remedy: str) -> dict[str, Any]:
         raise Damaged(f"{path}: holds no tensors and plain values ({reason}); {remedy}") from None
 
 
+_PLACE = ("rows", "origin", "index", "last", "driven", "epoch")
 _LONGEST_S = 1e6  # up to this distance from the first row, times keep its resolution
 
 
@@ -202,11 +204,11 @@ class BeliefStream:
     @contextmanager
     def _whole_or_nothing(self) -> Iterator[None]:
         """Where rows prove a unit wrong, restore the stream before them and the belief before their stretch."""
-        before = self._rows, self._origin, self._index, self._last, self._driven, self._epoch
+        before = self._place()
         try:
             yield
         except InputError:
-            self._rows, self._origin, self._index, self._last, self._driven, self._epoch = before
+            self._return_to(before)
             if self._units is not None and self._units.before is not None:
                 self.inference.load_state_dict(self._units.before)
                 self._units.clear()
@@ -338,12 +340,21 @@ class BeliefStream:
 
     def state_dict(self) -> dict[str, Any]:
         """The open window's rows and the belief: all that a resumed stream needs to continue bit for bit."""
-        clock = {"origin": self._origin, "index": self._index, "last": self._last, "window": self.window}
-        clock["driven"] = list(self._driven)
-        clock["epoch"] = self._epoch
-        own = {"estimator": self.estimator, "form": type(self.form).__name__, "vehicles": self.vehicles}
-        own["units"] = None if self._units is None else self._units.state_dict()
-        return {"rows": dict(self._rows), **clock, **own, "inference": self.inference.state_dict()}
+        units = None if self._units is None else self._units.state_dict()
+        return {**self._place(), **self._own(), "units": units, "inference": self.inference.state_dict()}
+
+    def _own(self) -> dict[str, Any]:
+        """What a saved stream must have in common with this one."""
+        form = type(self.form).__name__
+        return {"estimator": self.estimator, "form": form, "window": self.window, "vehicles": self.vehicles}
+
+    def _place(self) -> dict[str, Any]:
+        """How far the rows came. Its values are replaced, never changed."""
+        return {name: getattr(self, f"_{name}") for name in _PLACE}
+
+    def _return_to(self, place: Mapping[str, Any]) -> None:
+        for name in _PLACE:
+            setattr(self, f"_{name}", place[name])
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`. Where it is refused, the stream is unchanged.
@@ -352,12 +363,11 @@ class BeliefStream:
         """
         if not isinstance(state, dict):
             raise InputError(f"state: found a {type(state).__name__}, needs what a stream saves")
-        own = {"estimator": self.estimator, "form": type(self.form).__name__, "window": self.window}
-        for name, value in {**own, "vehicles": self.vehicles}.items():
+        for name, value in self._own().items():
             if type(state.get(name)) is not type(value) or state[name] != value:
                 setting = "by the estimator" if name == "estimator" else f"with {name}"
                 raise InputError(f"state: saved {setting} {str(state.get(name))[:40]!r}, not {value!r}")
-        if set(state) != {"rows", "epoch", "origin", "index", "last", "driven", "inference", "vehicles", "units", *own}:
+        if set(state) != {*_PLACE, *self._own(), "units", "inference"}:
             raise InputError(f"state: holds {', '.join(sorted(map(str, state)))[:200]}, not what a stream saves")
         stretch = StreamUnits(self.form.columns, self.vehicles)
         if state["units"] is not None:
@@ -372,10 +382,7 @@ class BeliefStream:
             raise
         if self._units is not None:
             self._units = stretch
-        self._rows = {name: value.clone() for name, value in state["rows"].items()}
-        self._origin, self._index, self._last = state["origin"], state["index"], state["last"]
-        self._driven = list(state["driven"])
-        self._epoch = state["epoch"]
+        self._return_to(state)
 
 
 def _moment(time: float, epoch: float | None) -> str:

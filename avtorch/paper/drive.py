@@ -116,16 +116,6 @@ def rows_from(run: Block, start: float, end: float | None = None) -> Block:
     return run[first:last]
 
 
-def rms_about_mean(x: Tensor) -> Tensor:
-    """Root mean square about the mean over time, the last dimension."""
-    return (x - x.mean(-1, keepdim=True)).square().mean(-1).sqrt()
-
-
-def rms(x: Tensor) -> Tensor:
-    """Root mean square over time, the last dimension."""
-    return x.square().mean(-1).sqrt()
-
-
 def _advance(loop: ClosedLoop, until: float, duration: float, progress: Progress | None) -> Block:
     """Advance to `until` [s], in pieces so that progress can be reported."""
     end, blocks = round(until / loop.dt), []

@@ -20,11 +20,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from avtorch.paper.drive import CHANGED, HEALTHY, NOISE, Progress, noise_seeds, rms
+from avtorch.paper.drive import CHANGED, HEALTHY, NOISE, Progress, noise_seeds
 from avtorch.paper.leaders import DRIVE_S, Ahead, Leaders
 from avtorch.paper.rows import ClaimRow, ClaimVerdict, median_interval, middle, number_list, sign
 from avtorch.vehicle import NOMINAL_GAINS, ClosedLoop, GLVDPlant, LinearController
 from avtorch.vehicle.block import Block
+from avtorch.vehicle.performance import rms
 from avtorch.vehicle.stability import peak_gain
 
 FACTORS = (1.0, 1.5, 2.0, 3.0)

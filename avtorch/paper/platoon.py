@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from avtorch.decision.settings import Setting
-from avtorch.paper.drive import ACT_S, CHANGED, Progress, drive, rms, rms_about_mean, rows_from, stacked
+from avtorch.paper.drive import ACT_S, CHANGED, Progress, drive, rows_from, stacked
 from avtorch.paper.leaders import PLATOON_S, Ahead, Leaders
 from avtorch.paper.rows import ClaimRow, median_interval, middle, sign
 from avtorch.paper.strategies import AS_BUILT, PRINTED, supervise
 from avtorch.vehicle.block import Block
+from avtorch.vehicle.performance import rms, rms_about_mean
 
 VEHICLES = 10
 PASSED_S = 80.0

@@ -35,8 +35,6 @@ from avtorch.paper.drive import (
     change,
     drive,
     noise_seeds,
-    rms,
-    rms_about_mean,
     rows_from,
     stacked,
 )
@@ -44,6 +42,7 @@ from avtorch.paper.leaders import DRIVE_S, Ahead, Leaders
 from avtorch.paper.rows import ClaimRow, ClaimVerdict, median_interval, middle, share, sign, spread
 from avtorch.vehicle import ClosedLoop, GLVDPlant
 from avtorch.vehicle.block import Block
+from avtorch.vehicle.performance import rms, rms_about_mean
 
 SETTLED_S = 45.0
 """Time at which every offered time gap has been reached [s]: 28 s, 15 s for 1.5 s at 0.1 s/s, and two seconds more."""

@@ -1,20 +1,19 @@
 """Distance of draws from a reference, window by window, and the distance that chance alone would cause.
 
 Every measure is per window and parameter, in the parameter's own units or in SDs of the reference. Each comes with the
-value expected from Monte Carlo error alone, so that a difference can be distinguished from noise. Effective sample
-sizes and R-hat are ArviZ's (extra ``validate``).
+value expected from Monte Carlo error alone, so that a difference can be distinguished from noise.
 
-R-hat and effective sample sizes are ArviZ's. Many short chains are joined into a few superchains first: its
-autocorrelations are those of single chains, and over a chain of twenty draws they are biased. At an autocorrelation of
-0.3 it counts 3 660 effective draws in 256 chains of 20 draws where there are 2 850; over eight superchains 2 875.
-Chains that stand still in different places are still detected.
+R-hat and effective sample sizes are ArviZ's (extra ``validate``). Many short chains are joined into a few superchains
+first: its autocorrelations are those of single chains, and over a chain of twenty draws they are biased. At an
+autocorrelation of 0.3 it counts 3 660 effective draws in 256 chains of 20 draws where there are 2 850; over eight
+superchains 2 875. Chains that stand still in different places are still detected.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from scipy.stats import binomtest, chi2
@@ -188,8 +187,10 @@ def agreement(posterior: Posterior, quadrature: Quadrature) -> Agreement:
     outside = (ordered - grid[..., -1:]).clamp_min(0).mean(-1) + (grid[..., :1] - ordered).clamp_min(0).mean(-1)
     w1 = torch.trapezoid((empirical - below).abs(), grid) + outside
     spread = torch.trapezoid((below * (1 - below)).sqrt(), grid)
-    exact = torch.zeros_like(quadrature.mean)
-    return _agreement(found, quadrature.mean, quadrature.sd, exact, exact, w1, spread, exact)
+    none = torch.zeros_like(quadrature.mean)
+    endless = torch.full_like(none, torch.inf)
+    exact = replace(found, mean=quadrature.mean, sd=quadrature.sd, mean_error=none, sd_error=none, ess_mean=endless)
+    return _agreement(found, exact, w1, spread)
 
 
 def between(posterior: Posterior, other: Posterior) -> Agreement:
@@ -215,27 +216,18 @@ def between(posterior: Posterior, other: Posterior) -> Agreement:
     w1 = (apart[:-1] * value.diff(dim=0)).sum(0)
     below = torch.arange(1, len(second), dtype=value.dtype)[:, None, None] / len(second)
     spread = ((below * (1 - below)).sqrt() * second.sort(0).values.diff(dim=0)).sum(0)
-    mean_error = reference.mean_error / reference.sd
-    sd_error = reference.sd_error / reference.sd
-    return _agreement(found, reference.mean, reference.sd, mean_error, sd_error, w1, spread, 1 / reference.ess_mean)
+    return _agreement(found, reference, w1, spread)
 
 
-def _agreement(
-    found: Diagnostics,
-    mean: Tensor,
-    sd: Tensor,
-    mean_error: Tensor,
-    sd_error: Tensor,
-    w1: Tensor,
-    spread: Tensor,
-    per_draw: Tensor,
-) -> Agreement:
-    """``mean_error``, ``sd_error`` (in SDs) and ``per_draw`` (one over the draws) are the reference's own."""
-    mean_difference, ratio = (found.mean - mean) / sd, found.sd / sd
-    mean_error = torch.hypot(found.mean_error / sd, mean_error)
-    sd_error = torch.hypot(found.sd_error / sd, ratio * sd_error)
+def _agreement(found: Diagnostics, reference: Diagnostics, w1: Tensor, spread: Tensor) -> Agreement:
+    """``spread``: the integral of ``sqrt(F (1 - F))`` of the reference's distribution function, as ``w1`` in its own
+    units."""
+    sd = reference.sd
+    mean_difference, ratio = (found.mean - reference.mean) / sd, found.sd / sd
+    mean_error = torch.hypot(found.mean_error / sd, reference.mean_error / sd)
+    sd_error = torch.hypot(found.sd_error / sd, ratio * (reference.sd_error / sd))
     # E|F_n - F| of n independent draws is sqrt(2/pi F (1 - F) / n)
-    expected = math.sqrt(2 / math.pi) * spread * (1 / found.ess_mean + per_draw).sqrt() / sd
+    expected = math.sqrt(2 / math.pi) * spread * (1 / found.ess_mean + 1 / reference.ess_mean).sqrt() / sd
     return Agreement(
         names=found.names,
         mean_difference=mean_difference,

@@ -3,10 +3,10 @@ r"""Kernel Stein discrepancy: the distance of draws from a density, from its sco
     KSD^2 = 1/n^2 sum_ij k_p(x_i, x_j),
     k_p(x, y) = s(x).s(y) k + s(x).grad_y k + s(y).grad_x k + tr grad_x grad_y k,     s = grad log p,
 
-with the inverse multiquadric kernel `k(x, y) = (c^2 + |x - y|^2)^(-1/2)`, for which a vanishing discrepancy implies
-convergence (Gorham and Mackey 2017). Under `p` the expectation of `k_p(x, .)` is zero, so for `n` independent exact
-draws `E KSD^2 = E k_p(x, x) / n`: the value to compare with. The p-value is a wild bootstrap (Chwialkowski, Strathmann
-and Gretton 2016).
+with the inverse multiquadric kernel `k(x, y) = (1 + |x - y|^2)^(-1/2)` in whitened coordinates, for which a vanishing
+discrepancy implies convergence (Gorham and Mackey 2017). Under `p` the expectation of `k_p(x, .)` is zero, so for `n`
+independent exact draws `E KSD^2 = E k_p(x, x) / n`: the value to compare with. The p-value is a wild bootstrap
+(Chwialkowski, Strathmann and Gretton 2016).
 """
 
 from __future__ import annotations
@@ -47,7 +47,6 @@ def stein_discrepancy(
     *,
     mode: Mode | None = None,
     points: int = 1000,
-    scale: float = 1.0,
     flip: float = 0.5,
     bootstrap: int = 200,
     generator: torch.Generator | None = None,
@@ -60,7 +59,6 @@ def stein_discrepancy(
         mode: of the density, if known; the draws are whitened by its Laplace covariance.
         points: at most so many draws are used, evenly spaced along the chains (and over the chains, where there are
             more chains than points).
-        scale: ``c`` of the kernel, in the whitened coordinates.
         flip: probability that the bootstrap's sign changes from one draw used to the next of its chain; 0.5 takes them
             as independent, less allows for their autocorrelation.
 
@@ -86,7 +84,7 @@ def stein_discrepancy(
     step = max(1, BLOCK // count**2)
     for first in range(0, windows, step):
         part = slice(first, first + step)
-        kernel = _stein_kernel(w[:, part].movedim(1, 0), score[:, part].movedim(1, 0), scale)
+        kernel = _stein_kernel(w[:, part].movedim(1, 0), score[:, part].movedim(1, 0))
         square = kernel.mean((-2, -1))
         wild = ((sign @ kernel) * sign).sum(-1) / count**2  # (window, bootstrap)
         value.append(square.clamp_min(0).sqrt())
@@ -112,7 +110,7 @@ def _signs(shape: torch.Size, count: int, flip: float, generator: torch.Generato
     return (1 - 2 * odd).flatten(1)
 
 
-def _stein_kernel(x: Tensor, score: Tensor, scale: float) -> Tensor:
+def _stein_kernel(x: Tensor, score: Tensor) -> Tensor:
     """``k_p`` of all pairs, ``(window, n, n)``, from points and scores ``(window, n, d)``."""
     inner = x @ x.mT
     size = inner.diagonal(dim1=-2, dim2=-1)
@@ -121,6 +119,6 @@ def _stein_kernel(x: Tensor, score: Tensor, scale: float) -> Tensor:
     cross = score @ x.mT
     own = cross.diagonal(dim1=-2, dim2=-1)
     along = own[..., :, None] + own[..., None, :] - cross - cross.mT
-    base = (scale**2 + square).reciprocal()
+    base = (1 + square).reciprocal()
     k = base.sqrt()
     return k * ((score @ score.mT) + base * (along + x.shape[-1] - 3 * square * base))

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.inference.density import Density, SelectableDensity
-from avtorch.inference.form import ExcitationRule, Form, JerkForm
-from avtorch.inference.jerk import JerkDensity, JerkStatistics
+from avtorch.inference.estimator import Form
+from avtorch.inference.jerk import ExcitationRule, JerkDensity, JerkForm, JerkStatistics
 from avtorch.inference.latent import LatentForm
 from avtorch.inference.priors import Joint, default_actuation_prior
 from avtorch.inference.sampler_settings import SamplerSettings

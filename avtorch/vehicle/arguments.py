@@ -13,10 +13,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Real
+from avtorch.arrays import Float, Real
 from avtorch.errors import InputError
 
 Number: TypeAlias = float | int | Tensor
+
+Batch: TypeAlias = Float[Tensor, "*#batch"]
+"""A tensor that broadcasts with the others of a call."""
+
+Signal: TypeAlias = Float[Tensor, "*#batch time"]
+"""Such tensors along a last dimension of time."""
 
 Batched: TypeAlias = float | int | Real[Tensor, "*#batch"]
 """A number, or a tensor that broadcasts with the others of a call."""

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
-from avtorch.vehicle.arguments import Batched, Number, checked, tensor
+from avtorch.vehicle.arguments import Batch, Batched, Number, checked, tensor
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,11 @@ class LowerLevel:
         object.__setattr__(self, "_on_demand", on_demand)
         object.__setattr__(self, "_limits", (low, high))
 
-    def raw_command(self, a: Float[Tensor, "*#batch"], u: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
+    def raw_command(self, a: Batch, u: Batch) -> Float[Tensor, "*all"]:
         """The command before clipping [m/s²] for measured acceleration `a` and demand `u` [m/s²], (..., scenario)."""
         return torch.addcmul(self._on_accel * a, self._on_demand, u)
 
-    def clip(self, raw: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
+    def clip(self, raw: Batch) -> Float[Tensor, "*all"]:
         """`raw` [m/s²] within the vehicle's limits."""
         return torch.clamp(raw, *self._limits)
 
@@ -75,7 +75,7 @@ class LowerLevel:
         slack = 1e-6  # [m/s²], tolerance of a solver
         return (command <= low + slack) | (command >= high - slack)
 
-    def command(self, a: Float[Tensor, "*#batch"], u: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
+    def command(self, a: Batch, u: Batch) -> Float[Tensor, "*all"]:
         """The command actually sent [m/s²]: `raw_command`, clipped. This is what the estimator takes as `u`."""
         return self.clip(self.raw_command(a, u))
 

@@ -92,12 +92,12 @@ def performance(run: Block, *, time_gap: Number | None = None, standstill: Numbe
         flow = equilibrium_throughput(mean, time_gap, standstill=standstill).expand(mean.shape)
     calm = (a.abs() <= COMFORT_ACCEL) & (run.jerk.abs() <= COMFORT_JERK)
     return Performance(
-        speed_rms_ratio=_rms(v - v.mean(-1, keepdim=True)) / _moving(_rms(lead_v - lead_v.mean(-1, keepdim=True))),
-        accel_rms_ratio=_rms(a) / _moving(_rms(lead_a)),
+        speed_rms_ratio=rms_about_mean(v) / _moving(rms_about_mean(lead_v)),
+        accel_rms_ratio=rms(a) / _moving(rms(lead_a)),
         min_spacing_m=run.spacing.amin(-1),
         min_ttc_s=ttc.amin(-1).clamp(min=0.0),
         safe_share=(run.spacing >= needed).to(v.dtype).mean(-1),
-        jerk_rms_mps3=_rms(run.jerk),
+        jerk_rms_mps3=rms(run.jerk),
         clipped_share=run.clipped.to(v.dtype).mean(-1),
         comfort_share=calm.to(v.dtype).mean(-1),
         energy_jpkgm=(traction.sum(-1) * dt) / (v.sum(-1) * dt),
@@ -114,8 +114,14 @@ def equilibrium_throughput(speed: Batched, time_gap: Batched, *, standstill: Bat
     return 3600 * v / (gap * v + tensor(standstill) + VEHICLE_LENGTH_M)
 
 
-def _rms(x: Tensor) -> Tensor:
-    return (x * x).mean(-1).sqrt()
+def rms(x: Float[Tensor, "*scenario time"]) -> Float[Tensor, "*scenario"]:
+    """Root mean square over time, the last dimension."""
+    return x.square().mean(-1).sqrt()
+
+
+def rms_about_mean(x: Float[Tensor, "*scenario time"]) -> Float[Tensor, "*scenario"]:
+    """Root mean square about the mean over time, the last dimension."""
+    return rms(x - x.mean(-1, keepdim=True))
 
 
 def _moving(x: Tensor) -> Tensor:

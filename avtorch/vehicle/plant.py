@@ -18,7 +18,7 @@ from torch import Tensor
 
 from avtorch.arrays import Float
 from avtorch.errors import InputError
-from avtorch.vehicle.arguments import Number, checked
+from avtorch.vehicle.arguments import Batch, Number, checked
 from avtorch.vehicle.glvd import Method, motion_coefficients
 
 Motion = tuple[Tensor, Tensor, Tensor]
@@ -27,14 +27,7 @@ Motion = tuple[Tensor, Tensor, Tensor]
 class Plant(Protocol):
     """The interface that the loop needs of a plant."""
 
-    def step(
-        self,
-        a: Float[Tensor, "*#batch"],
-        v: Float[Tensor, "*#batch"],
-        u: Float[Tensor, "*#batch"],
-        dt: float,
-        eps: Float[Tensor, "*#batch"],
-    ) -> Motion:
+    def step(self, a: Batch, v: Batch, u: Batch, dt: float, eps: Batch) -> Motion:
         """Acceleration [m/s²], speed [m/s] and displacement [m] after `dt` [s], command `u` and noise `eps` held."""
         ...
 
@@ -81,25 +74,18 @@ class GLVDPlant:
             raise InputError(f"accel_min: found {self.accel_min} with accel_max {self.accel_max}, needs a lower value")
         object.__setattr__(self, "_coefficients", {})
 
-    def target(self, u: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
+    def target(self, u: Batch) -> Float[Tensor, "*all"]:
         """Steady-state acceleration under a held `u`, without noise: `K_L u` within the physical limits [m/s²]."""
         wanted = self._gain * u
         if self.accel_min is None and self.accel_max is None:
             return wanted
         return torch.clamp(wanted, self.accel_min, self.accel_max)
 
-    def jerk(self, a: Float[Tensor, "*#batch"], u: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
+    def jerk(self, a: Batch, u: Batch) -> Float[Tensor, "*all"]:
         """Noise-free instantaneous jerk [m/s³]."""
         return (self.target(u) - a) / self._lag
 
-    def step(
-        self,
-        a: Float[Tensor, "*#batch"],
-        v: Float[Tensor, "*#batch"],
-        u: Float[Tensor, "*#batch"],
-        dt: float,
-        eps: Float[Tensor, "*#batch"],
-    ) -> Motion:
+    def step(self, a: Batch, v: Batch, u: Batch, dt: float, eps: Batch) -> Motion:
         """See `Plant.step`."""
         if self.method == "euler":
             return a + dt * (self.jerk(a, u) + eps), v + dt * a, dt * v

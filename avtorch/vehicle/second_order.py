@@ -21,7 +21,7 @@ from torch import Tensor
 
 from avtorch.arrays import Float, Real
 from avtorch.errors import InputError
-from avtorch.vehicle.arguments import Number, broadcast, checked
+from avtorch.vehicle.arguments import Batch, Number, Signal, broadcast, checked
 from avtorch.vehicle.glvd import glvd_rollout
 
 
@@ -76,11 +76,7 @@ class PositionLag(torch.nn.Module):
         self.zeta = torch.nn.Parameter(checked("zeta", zeta, least=0.0).detach().clone())
 
     def rollout(
-        self,
-        x0: Float[Tensor, "*#batch"],
-        v0: Float[Tensor, "*#batch"],
-        x_cmd: Float[Tensor, "*#batch time"],
-        dt: float,
+        self, x0: Batch, v0: Batch, x_cmd: Signal, dt: float
     ) -> tuple[Float[Tensor, "*all time"], Float[Tensor, "*all time"]]:
         """Positions [m] and speeds [m/s] at steps 1…N, each ``(..., time)``, under held commands ``(..., time)``.
 

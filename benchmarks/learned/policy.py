@@ -22,7 +22,7 @@ from avtorch.decision import Setting, Strategist
 from avtorch.decision.grid import Grid
 from avtorch.decision.supervisor import Supervisor
 from avtorch.errors import InputError
-from avtorch.paper.drive import CHANGE_S, CHANGED, HEALTHY, NOISE, change, rms, rms_about_mean, rows_from
+from avtorch.paper.drive import CHANGE_S, CHANGED, HEALTHY, NOISE, change, rows_from
 from avtorch.vehicle import (
     ClosedLoop,
     Controller,
@@ -35,6 +35,7 @@ from avtorch.vehicle import (
     measured_gain,
     stability,
 )
+from avtorch.vehicle.performance import rms, rms_about_mean
 
 try:
     import gymnasium as gym

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from avtorch.inference import JerkDensity
-from avtorch.inference.exponential_form import ExponentialForm, PotentialTerms
+from avtorch.inference.density import ExponentialForm, PotentialTerms
 from avtorch.inference.priors import (
     Joint,
     LogSpaceNormal,

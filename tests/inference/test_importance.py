@@ -13,10 +13,10 @@ from avtorch.errors import InputError
 from avtorch.inference import integrate
 from avtorch.inference.density import Density
 from avtorch.inference.estimators import ImportanceSampling
-from avtorch.inference.estimators.other_posteriors import FIRST, _Solved
 from avtorch.inference.importance import ImportanceSettings, WeightedDraws, weighted_draws
 from avtorch.inference.latent import LatentDensity, LatentWindow, default_noise_prior
 from avtorch.inference.map import Mode
+from avtorch.inference.sequential import FIRST, Solved
 from avtorch.validation import synthetic_windows
 from tests.bars import BAR
 from tests.inference.latent_windows import drawn_window
@@ -132,7 +132,7 @@ def _below(draws: WeightedDraws, bound: Tensor) -> tuple[Tensor, Tensor]:
 class Drawn(ImportanceSampling):
     """Without SGLD behind it, which takes minutes where rows are uneven: windows that it would sample are not used."""
 
-    def _chains(self, density: Density, mode: Mode) -> _Solved:
+    def _chains(self, density: Density, mode: Mode) -> Solved:
         never = torch.zeros(density.windows, dtype=torch.bool)
         return self._drawn(density, mode, FIRST)._replace(converged=never)
 

@@ -18,7 +18,7 @@ from avtorch.paper import (
     regions,
     strategies,
 )
-from avtorch.paper.drive import CHANGED, ESTIMATED, rms_about_mean, rows_from
+from avtorch.paper.drive import CHANGED, ESTIMATED, rows_from
 from avtorch.paper.estimation import GAINS, LAGS, Estimation, Sweep
 from avtorch.paper.gains import _lag
 from avtorch.paper.monitoring import PAPER_ALERT_S, Watched
@@ -27,6 +27,7 @@ from avtorch.paper.regions import CASES, FORMS, Regions
 from avtorch.paper.strategies import AS_BUILT, OURS, PRINTED, UNITY
 from avtorch.vehicle import Leader, simulate
 from avtorch.vehicle.block import Block
+from avtorch.vehicle.performance import rms_about_mean
 from avtorch.vehicle.stability import peak_gain, region, string_stable
 from tests.bars import BAR
 

@@ -11,10 +11,11 @@ import torch
 from avtorch.decision.settings import Setting
 from avtorch.errors import InputError
 from avtorch.paper import EXPERIMENTS, Leaders, reproduce
-from avtorch.paper.drive import ACT_S, drive, noise_seeds, rms_about_mean, rows_from, stacked
+from avtorch.paper.drive import ACT_S, drive, noise_seeds, rows_from, stacked
 from avtorch.paper.leaders import DRIVE_S, PLATOON_S, SWEEP_S
 from avtorch.paper.rows import ClaimRow, error, median_interval, number_list, share, sign, spread, within
 from avtorch.vehicle import Leader
+from avtorch.vehicle.performance import rms_about_mean
 from tests.bars import BAR
 
 

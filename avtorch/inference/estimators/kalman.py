@@ -18,7 +18,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -26,15 +26,18 @@ from torch import Tensor
 from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.inference.belief import Summary
-from avtorch.inference.estimator import WindowedEstimator
-from avtorch.inference.form import Form, JerkForm, Rows
-from avtorch.inference.jerk import JerkStatistics
+from avtorch.inference.estimator import Form, Rows, WindowedEstimator
+from avtorch.inference.jerk import JerkForm, JerkStatistics
 from avtorch.inference.latent import GAP, NOISE_PRIOR, LatentForm
 from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, Step, discretise, initial_covariance
 from avtorch.inference.priors import LogNormalPrior
 
 PLAUSIBLE = ((0.01, 20.0), (0.02, 20.0))
 """Bounds of ``T_L`` [s] and ``K_L``; a filter that leaves them has diverged, and restarts from the prior."""
+
+Pair: TypeAlias = Float[Tensor, "*point vehicle 2"]
+Whole: TypeAlias = Float[Tensor, "*point vehicle 6"]
+"""States of the jerk form, ``(log T_L, log K_L)``, and of the latent form."""
 
 _ROWS = {"speed": SPEED_ROW, "accel": ACCEL_ROW}
 
@@ -76,11 +79,11 @@ class JerkState:
         """The state at the first row of a run, given the belief in ``(log T_L, log K_L)``."""
         return actuation
 
-    def advance(self, x: Float[Tensor, "*point vehicle 2"], row: Observation) -> Float[Tensor, "*point vehicle 2"]:
+    def advance(self, x: Pair, row: Observation) -> Pair:
         """The state a step later without noise, shape of ``x``."""
         return x
 
-    def slope(self, x: Float[Tensor, "*point vehicle 2"], row: Observation) -> Float[Tensor, "*point vehicle 2 2"]:
+    def slope(self, x: Pair, row: Observation) -> Float[Tensor, "*point vehicle 2 2"]:
         """Derivative of :meth:`advance`, ``(..., vehicle, d, d)``."""
         return self._still.expand(*x.shape, 2)
 
@@ -88,16 +91,12 @@ class JerkState:
         """Covariance of the step's noise at ``x`` ``(vehicle, d)``, broadcastable to ``(vehicle, d, d)``."""
         return row.dt * self._walk
 
-    def observe(
-        self, x: Float[Tensor, "*point vehicle 2"], row: Observation, channel: int
-    ) -> Float[Tensor, "*point vehicle"]:
+    def observe(self, x: Pair, row: Observation, channel: int) -> Float[Tensor, "*point vehicle"]:
         """The channel's reading without noise, ``(..., vehicle)``."""
         log_T, log_K = x.unbind(-1)
         return (log_K.exp() * row.u - row.a) * (-log_T).exp()
 
-    def observed_slope(
-        self, x: Float[Tensor, "*point vehicle 2"], row: Observation, channel: int
-    ) -> Float[Tensor, "*point vehicle 2"]:
+    def observed_slope(self, x: Pair, row: Observation, channel: int) -> Pair:
         """Derivative of :meth:`observe`, ``(..., vehicle, d)``."""
         by_gain = (x[..., 1] - x[..., 0]).exp() * row.u
         return torch.stack([(-x[..., 0]).exp() * row.a - by_gain, by_gain], -1)
@@ -144,12 +143,12 @@ class LatentState:
         parameters = (n["process_noise"], road, n["coloured_sd"], n["coloured_time"])
         return discretise(x[..., 4].exp(), x[..., 5].exp(), *parameters, row.dt)
 
-    def advance(self, x: Float[Tensor, "*point vehicle 6"], row: Observation) -> Float[Tensor, "*point vehicle 6"]:
+    def advance(self, x: Whole, row: Observation) -> Whole:
         step = self._step(x, row)
         moved = (step.transition @ x[..., :4, None])[..., 0] + step.gain * row.u[:, None]
         return torch.cat([moved, x[..., 4:]], -1)
 
-    def slope(self, x: Float[Tensor, "*point vehicle 6"], row: Observation) -> Float[Tensor, "*point vehicle 6 6"]:
+    def slope(self, x: Whole, row: Observation) -> Float[Tensor, "*point vehicle 6 6"]:
         step = self._step(x, row)
         a, K, u = x[..., 1], x[..., 5].exp(), row.u
         decay, reach = step.transition[..., 1, 1], step.transition[..., 0, 1]
@@ -166,14 +165,10 @@ class LatentState:
         out[..., 4, 4] = out[..., 5, 5] = self.drift**2 * row.dt
         return out
 
-    def observe(
-        self, x: Float[Tensor, "*point vehicle 6"], row: Observation, channel: int
-    ) -> Float[Tensor, "*point vehicle"]:
+    def observe(self, x: Whole, row: Observation, channel: int) -> Float[Tensor, "*point vehicle"]:
         return x @ self._rows[channel]
 
-    def observed_slope(
-        self, x: Float[Tensor, "*point vehicle 6"], row: Observation, channel: int
-    ) -> Float[Tensor, "*point vehicle 6"]:
+    def observed_slope(self, x: Whole, row: Observation, channel: int) -> Whole:
         return self._rows[channel].expand_as(x)
 
 

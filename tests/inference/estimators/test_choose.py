@@ -12,7 +12,7 @@ from avtorch.decision.watch import Watch
 from avtorch.errors import InputError
 from avtorch.inference import BeliefStream, SamplerSettings
 from avtorch.inference.estimators import ESTIMATORS, make_estimator
-from avtorch.inference.form import JerkForm
+from avtorch.inference.jerk import JerkForm
 from avtorch.inference.latent import LatentForm
 from tests.bars import BAR
 
