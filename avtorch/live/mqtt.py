@@ -116,7 +116,6 @@ class MqttSource:
 
     def __init__(self, address: MqttAddress, parser: LineParser, *, client_id: str | None = None) -> None:
         self.address, self.parser = address, parser
-        self.name = address.name
         self._rows: list[Row] = []
         self._refused: str | None = None
         self._client = _client(address, client_id)
@@ -135,7 +134,7 @@ class MqttSource:
                     if fault or not had or self._client.loop(0.0) or len(self._rows) == had:
                         break
                 if self._refused is not None:
-                    raise InputError(f"{self.name}: the broker refuses ({self._refused})")
+                    raise InputError(f"{self.address.name}: the broker refuses ({self._refused})")
                 rows, self._rows = self._rows, []
                 yield Batch(rows)
                 if fault:

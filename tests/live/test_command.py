@@ -156,7 +156,7 @@ def test_metrics_are_served_while_it_runs(here: Path, capsys: pytest.CaptureFixt
     pages = []
 
     class Lines:
-        name, identity = "lines", None
+        identity = None
 
         def batches(self, stop, start=None):
             for line in [*lines(fleet(4.2)).splitlines(), b"{"]:

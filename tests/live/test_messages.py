@@ -17,7 +17,7 @@ from tests.live.drives import drive, fleet, lines
 class Rows:
     """A source of rows that are there."""
 
-    name, identity = "rows", None
+    identity = None
 
     def __init__(self, rows, size=97):
         self.rows, self.size = rows, size
