@@ -20,7 +20,7 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.live import Counts, LineParser, LiveWatch, MqttAddress, MqttSink, MqttSource, watch_source
-from tests.live.drives import fleet
+from tests.live.drives import fleet, until
 
 mqtt = pytest.importorskip("paho.mqtt.client")
 
@@ -51,12 +51,15 @@ def broker(port: int, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
         process.wait(20)
 
 
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
 @pytest.fixture
 def port(tmp_path: Path) -> Iterator[int]:
-    free = socket.socket()
-    free.bind(("127.0.0.1", 0))
-    number = free.getsockname()[1]
-    free.close()
+    number = free_port()
     with broker(number, tmp_path):
         yield number
 
@@ -66,13 +69,6 @@ def client(port: int) -> Any:
     made.connect("127.0.0.1", port)
     made.loop_start()
     return made
-
-
-def until(what: Any) -> None:
-    end = time.monotonic() + 60
-    while not what():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 @needs_broker
@@ -130,10 +126,7 @@ def test_rows_in_answers_out(port: int) -> None:
 @needs_broker
 @pytest.mark.slow
 def test_it_survives_the_brokers_restart(tmp_path: Path) -> None:
-    free = socket.socket()
-    free.bind(("127.0.0.1", 0))
-    port = free.getsockname()[1]
-    free.close()
+    port = free_port()
     counts, stop = Counts(), Event()
     watch = LiveWatch(counts=counts)
     source = MqttSource(MqttAddress.of(f"mqtt://127.0.0.1:{port}/cars"), LineParser(counts))
