@@ -63,10 +63,11 @@ def fleet_answer(found: LogList, folder: FleetFolder, settings: FleetSettings) -
             for car in cars:
                 if car["car"] in own:
                     car["effects"][name] = own[car["car"]]
+    place = {}
     for car in cars:
         car["siblings"] = beside.get(car["car"])
-        car["reason"] = _reason(car, settings.target)
-    cars.sort(key=_rank)
+        car["reason"], place[car["car"]] = _reason(car, settings.target)
+    cars.sort(key=lambda car: _rank(car, place[car["car"]]))
     elsewhere = folder.others(list(found.logs))
     notes = [f"The folder has rows of {elsewhere} more logs, which this call did not name."] if elsewhere else []
     failed = sum(bool(log["errors"]) for car in cars for log in car["logs"])
@@ -186,29 +187,28 @@ def _diagnosed(row: Row) -> Diagnosed:
     return {"named": named, "alike": alike, "sizes": sizes}
 
 
-def _reason(car: dict[str, Any], target: float) -> str:
-    stable, change, gap = car["p_string_stable"], car["change"], car["gap"]
+def _reason(car: dict[str, Any], target: float) -> tuple[str, float]:
+    """Why a car is where it is, and its place among cars of that reason, the first the lowest."""
+    stable, change, siblings, gap = (car[key] for key in ("p_string_stable", "change", "siblings", "gap"))
     if stable is not None and stable["now"] < target:
-        return "below target"
+        return "below target", stable["now"]
     if any(log["errors"] for log in car["logs"]):
-        return "failed"
-    if change is not None and max(one["in_sd"] for one in change.values()) >= CHANGED:
-        return "changed"
-    if car["siblings"] is not None and car["siblings"]["q_value"] <= APART:
-        return "unlike siblings"
-    if gap is not None and gap["verdict"] != ["none"]:
-        return "gap"
-    return "sound" if stable is not None or gap is not None else "no answer"
-
-
-def _rank(car: dict[str, Any]) -> tuple[Any, ...]:
-    stable, change, gap = car["p_string_stable"], car["change"], car["gap"]
-    probability = 1.0 if stable is None else stable["now"]
+        return "failed", 0.0
     changed = 0.0 if change is None else max(one["in_sd"] for one in change.values())
+    if changed >= CHANGED:
+        return "changed", -changed
+    if siblings is not None and siblings["q_value"] <= APART:
+        return "unlike siblings", min(siblings[name]["tail"] for name in QUANTITIES)
+    if gap is not None and gap["verdict"] != ["none"]:
+        return "gap", 0.0
+    return "no answer" if stable is None and gap is None else "sound", 0.0
+
+
+def _rank(car: dict[str, Any], place: float) -> tuple[Any, ...]:
+    stable, gap = car["p_string_stable"], car["gap"]
     size = 0.0 if gap is None or gap["before"] is None else gap["before"]
-    apart = 1.0 if car["siblings"] is None else min(car["siblings"][name]["tail"] for name in QUANTITIES)
-    order = {"below target": probability, "changed": -changed, "unlike siblings": apart}.get(car["reason"], 0.0)
-    return REASONS.index(car["reason"]), order, -size, probability, car["car"]
+    probability = 1.0 if stable is None else stable["now"]
+    return REASONS.index(car["reason"]), place, -size, probability, car["car"]
 
 
 def _when(log: FleetLog) -> tuple[bool, datetime, str]:
