@@ -15,11 +15,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
 from avtorch.errors import InputError
-from avtorch.live import Counts, LineParser, LiveWatch, MqttAddress, MqttSink, MqttSource, watch_source
+from avtorch.live import Answer, Counts, LineParser, LiveWatch, MqttAddress, MqttSink, MqttSource, watch_source
+from avtorch.live.mqtt import UNACKNOWLEDGED
 from tests.live.drives import fleet, until
 
 mqtt = pytest.importorskip("paho.mqtt.client")
@@ -185,6 +187,27 @@ def test_the_broker_keeps_what_comes_between_two_runs(port: int, tmp_path: Path)
     _, err = second.communicate(timeout=60)
     other.loop_stop()
     assert f"{len(rows)} rows of 3 cars, 9 windows" in err.decode()
+
+
+def test_answers_wait_where_the_broker_acknowledges_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a broker; the last ones go out where the watch is stopped, and the end waits for them a little."""
+    sent = MagicMock()
+    monkeypatch.setattr("avtorch.live.mqtt._client", lambda address, name: sent)
+    monkeypatch.setattr("avtorch.live.mqtt.CLOSE_S", 0.1)
+    stop, answer = Event(), Answer({}, "red", 1, None)
+    sink = MqttSink(MqttAddress.of("mqtt://localhost/answers"), stop)
+    work = threading.Thread(target=lambda: [sink.write(answer) for _ in range(UNACKNOWLEDGED + 9)])
+    work.start()
+    until(lambda: sent.publish.call_count == UNACKNOWLEDGED)
+    for _ in range(4):
+        sent.on_publish(sent, None, 1, None, None)
+    until(lambda: sent.publish.call_count == UNACKNOWLEDGED + 4)
+    assert work.is_alive()
+    stop.set()
+    work.join(20)
+    assert sent.publish.call_count == UNACKNOWLEDGED + 9
+    sink.close()
+    assert sent.disconnect.called
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,6 @@ def test_a_bag_gives_the_windows_of_its_rows(
 @pytest.mark.usefixtures("in_this_process")
 def test_it_goes_on_at_the_row_where_it_stopped(tmp_path: Path) -> None:
     path, told = parquet(tmp_path / "drive.parquet"), io.StringIO()
-
     for _ in range(3):
         watch, stop, source = LiveWatch(), Event(), PlayedLog(path, rate=100.0)
         kept = KeptCars(tmp_path / "state", source.identity)
