@@ -31,7 +31,7 @@ import avtorch.vehicle.stability
 from avtorch.cli import main
 from avtorch.gap import DeadTime, plant
 from tests.cli.test_diagnose import answer, columns, write
-from tests.faulty_disk import disk, fails, interrupts, old_or_new, tree, visible
+from tests.faulty_disk import disk, fails, old_or_new, tree, visible
 
 STATE = frozenset({"fits.json", "fits_of.json"})
 """Files kept for resuming; they belong to no answer."""
@@ -204,24 +204,3 @@ def test_a_reader_at_any_moment_and_a_kill(command: Command) -> None:
         shutil.rmtree(command.out)
         (killed / str(n)).rename(command.out)
         answers.follow()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", [diagnose], indirect=True, ids=["diagnose"])
-def test_an_interruption_at_the_nth_call(command: Command, capsys: pytest.CaptureFixture[str]) -> None:
-    answers = Answers(command)
-    for n in range(1, 2000):
-        capsys.readouterr()
-        with disk(command.out, interrupts(n), reads=False) as calls:
-            code = command.run("new")
-        said = capsys.readouterr().err
-        assert code == (0 if said == "" else 130)
-        if said == "":
-            assert answers.seen() == answers.new
-        else:
-            assert answers.judge() in ("old", "mixed", "new")
-        answers.follow()
-        answers.again()
-        if len(calls) < n:
-            return
-    raise AssertionError("the sweep has no end")
