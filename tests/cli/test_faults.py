@@ -33,9 +33,6 @@ from avtorch.gap import DeadTime, plant
 from tests.cli.test_diagnose import answer, columns, write
 from tests.faulty_disk import disk, fails, old_or_new, tree, visible
 
-STATE = frozenset({"fits.json", "fits_of.json"})
-"""Files kept for resuming; they belong to no answer."""
-
 
 class Command:
     """A command with stubs for its work: the command line for the `old` answer, and the one for the `new`."""
@@ -135,11 +132,11 @@ class Answers:
         self.followed: set[tuple] = set()
 
     def seen(self) -> dict[str, str]:
-        return visible(self.command.out, besides=STATE)
+        return visible(self.command.out)
 
     def judge(self) -> str:
         """`old`, `new`, or `mixed`, which is recognised."""
-        return old_or_new(self.command.out, self.json, self.old, self.new, besides=STATE)
+        return old_or_new(self.command.out, self.json, self.old, self.new)
 
     def again(self) -> None:
         shutil.rmtree(self.command.out)
