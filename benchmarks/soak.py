@@ -132,7 +132,7 @@ def drive(clock: FloatArray, cars: int, rng: np.random.Generator) -> FloatArray:
 class Stretch:
     """The lines of a stretch as a source that is read on from a position, the number of a line since the first."""
 
-    name, identity = "simulated cars", "simulated cars"
+    identity = "simulated cars"
 
     def __init__(self, parser: LineParser, chunks: list[Chunk], begin: int) -> None:
         self.parser, self.chunks, self.begin = parser, chunks, begin

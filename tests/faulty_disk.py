@@ -48,25 +48,23 @@ def interrupts(at: int) -> Call:
     return call
 
 
-def visible(folder: Path, *, besides: frozenset[str] = frozenset()) -> dict[str, str]:
+def visible(folder: Path) -> dict[str, str]:
     """The content of a folder for a reader: each file's content by name, links followed, none of them dangling."""
     if not folder.is_dir():
         return {}
     return {
         p.name: hashlib.sha256(p.read_bytes()).hexdigest()
         for p in folder.iterdir()
-        if p.is_file() and not p.name.startswith(".") and p.name not in besides
+        if p.is_file() and not p.name.startswith(".")
     }
 
 
-def old_or_new(
-    folder: Path, answer: str, old: dict[str, str], new: dict[str, str], *, besides: frozenset[str] = frozenset()
-) -> str:
+def old_or_new(folder: Path, answer: str, old: dict[str, str], new: dict[str, str]) -> str:
     """What a reader finds of the JSON `answer` and its files: `old`, `new`, or `mixed`, which `read_answer` refuses.
 
     Each file is whole, the old one or the new one; and what is not refused is all of one answer.
     """
-    seen = visible(folder, besides=besides)
+    seen = visible(folder)
     for name in old.keys() | new.keys() | seen.keys():
         assert seen.get(name) in (old.get(name), new.get(name)), name
     try:

@@ -161,6 +161,7 @@ def test_run_detects_the_change_and_acts(tmp_path: Path, capsys: pytest.CaptureF
         assert "min_ttc_s" in figures
     pictures = {"motion.png", "region.png", "overview.png"}
     assert {p.name for p in tmp_path.glob("[!.]*")} == {"run.json", "run.html", *pictures}
+    assert set(answer["files"]) == {"run.html", *pictures}, "all of one set"
 
 
 @pytest.mark.slow

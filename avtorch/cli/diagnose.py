@@ -172,13 +172,12 @@ def diagnose(
     read = [Log.read(path, map=map, unit=unit, stamp=stamp) for path in logs]
     refuse_loop(simulated, read)
     drives, fit, about_map = commanded(talk, read)
-    for path, drive in zip(logs, drives, strict=True):
-        _usable(path, drive, accel_kind)
-        _check_effects(chosen or (), path, drive)
+    with_paths = list(zip(logs, drives, strict=True))
+    for path, drive in with_paths:
+        _usable(path, drive, accel_kind, chosen or ())
     track = ("speed_min", "speed_max", "accel_min", "accel_max", "road", "seconds")
     limits = _limits(drives, {name: given[name] for name in track})
     alarms = read_alarms(estimates, drives) if estimates else ()
-    with_paths = list(zip(logs, drives, strict=True))
     own = simulator_of(
         simulated or (), simulator, step, with_paths, adjust=adjust or (), rollouts=rollouts, processes=processes
     )
@@ -302,14 +301,13 @@ def print_diagnosis(talk: Talk, found: Diagnosis, *, verbose: bool = False) -> N
     if not found.complete:
         text = "The budget ended the search: the answer is provisional; give the command a larger one."
         talk.lines([text], "yellow")
+    budget = found.budget
     if verbose:
         talk.lines([*sentences.tested(found), *sentences.budget(found)])
-    elif found.budget is not None and found.budget.rest:
-        talk.lines([found.budget.rest])
-    if verbose:
         talk.lines([found.verdict.why], "dim")
+    elif budget is not None and budget.rest:
+        talk.lines([budget.rest])
     talk.line("")
-    budget = found.budget
     divided = budget is not None and (budget.parts or budget.chance or budget.unexplained.material)
     if budget is not None and divided:
         talk.table(budget_table(budget, found.log.epochs_s[0]))
@@ -376,19 +374,15 @@ def _prior(given: Sequence[str]) -> dict[str, float]:
     return weights
 
 
-def _usable(path: Path, drive: Log, accel_kind: str) -> None:
+def _usable(path: Path, drive: Log, accel_kind: str, effects: Sequence[str]) -> None:
+    """Raises `InputError` for a log without a row to use, and for options that its channels cannot answer."""
+    from avtorch.gap import EFFECTS
     from avtorch.io.quality import require_usable
 
     require_usable(drive)
     if accel_kind == "specific-force" and drive.accel is None:
         raise InputError(f"--accel-kind: found specific-force, but {path} has no accel")
-
-
-def _check_effects(names: Sequence[str], path: Path, drive: Log) -> None:
-    """Report a requested effect that the log's channels cannot show."""
-    from avtorch.gap import EFFECTS
-
-    for name in names:
+    for name in effects:
         for signal, needed in (("accel", EFFECTS[name].place == "sensor"), ("speed", EFFECTS[name].needs_speed)):
             if needed and getattr(drive, signal) is None:
                 raise InputError(f"--effects: found {name}, which no log without {signal} can show, such as {path}")
@@ -406,11 +400,8 @@ def read_alarms(paths: Sequence[Path], logs: Sequence[Log]) -> tuple[Alarm, ...]
     """
     if len(paths) != len(logs):
         raise InputError(f"--estimates: found {len(paths)} for {len(logs)} logs, needs one for each, in their order")
-    return tuple(
-        alarm
-        for number, (path, log) in enumerate(zip(paths, logs, strict=True))
-        for alarm in _alarms(path, log, number)
-    )
+    each = enumerate(zip(paths, logs, strict=True))
+    return tuple(alarm for number, (path, log) in each for alarm in _alarms(path, log, number))
 
 
 def _alarms(path: Path, log: Log, number: int) -> list[Alarm]:

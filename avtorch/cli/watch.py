@@ -155,12 +155,8 @@ def _source(
         return StreamSource(parser, sys.stdin.fileno())
     if is_mqtt(source):
         # by its folder: the broker keeps for the next run what comes between two of them
-        name = None
-        if state is not None:
-            name = (
-                "avtorch-" + hashlib.sha256(str(state.absolute()).encode("utf-8", "surrogateescape")).hexdigest()[:16]
-            )
-        return MqttSource(MqttAddress.of(source), parser, client_id=name)
+        folder = None if state is None else hashlib.sha256(os.fsencode(state.absolute())).hexdigest()[:16]
+        return MqttSource(MqttAddress.of(source), parser, client_id=folder and f"avtorch-{folder}")
     if played:
         return PlayedLog(source, map=map, unit=unit, rate=rate, car=car)
     return FileSource(source, parser, follow=follow)

@@ -8,6 +8,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean, variance
 from typing import TYPE_CHECKING, Any, Literal
 
 from avtorch.errors import InputError, quoted
@@ -162,22 +163,17 @@ def drive_belief(used: Sequence[Row]) -> Drive | None:
     The standard deviation of their mean is by what the windows differ by, or by what their posteriors say, whichever is
     more. What windows of a drive have in common is the spread from drive to drive.
     """
+    if not used:
+        return None
     found = {}
     for name in QUANTITIES:
-        means, variances = [], []
-        for row in used:
-            mean, sd = row[f"{name}_mean"], row[f"{name}_sd"]
-            if mean is None or sd is None or not (math.isfinite(mean) and math.isfinite(sd) and mean > 0):
-                return None
-            variances.append(math.log1p((sd / mean) ** 2))
-            means.append(math.log(mean) - variances[-1] / 2)
-        count = len(means)
-        if not count:
+        stats = [(row[f"{name}_mean"], row[f"{name}_sd"]) for row in used]
+        if any(x is None or not math.isfinite(x) for both in stats for x in both) or min(stats)[0] <= 0:
             return None
-        mean = sum(means) / count
-        spread = sum((x - mean) ** 2 for x in means) / max(1, count - 1)
-        variance = max(spread, sum(variances) / count) / count
-        found[name] = (mean, max(math.sqrt(variance), LEAST_SD))
+        variances = [math.log1p((sd / mean) ** 2) for mean, sd in stats]
+        means = [math.log(mean) - v / 2 for (mean, _), v in zip(stats, variances, strict=True)]
+        spread = variance(means) if len(means) > 1 else 0.0
+        found[name] = (fmean(means), max(math.sqrt(max(spread, fmean(variances)) / len(means)), LEAST_SD))
     return found
 
 
@@ -298,14 +294,14 @@ def read_rows(out: str | os.PathLike[str], dataset: str) -> pa.Table:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    step = next((step for step, name in DATASETS.items() if name == dataset), None)
-    if step is None:
+    if dataset not in DATASETS.values():
         raise InputError(f"dataset: found {quoted(dataset)}, needs {', '.join(DATASETS.values())}")
+    folder = Path(out) / dataset
     # a folder that another process writes to holds files of passing names, which begin with a dot
-    files = sorted(p for p in (Path(out) / dataset).glob("*.parquet") if not p.name.startswith("."))
+    files = sorted(folder.glob("[!.]*.parquet"))
     if not files:
-        raise InputError(f"{Path(out) / dataset}: has no rows; needs the --out of avtorch fleet")
+        raise InputError(f"{folder}: has no rows; needs the --out of avtorch fleet")
     try:
         return pa.concat_tables(pq.ParquetFile(file).read().replace_schema_metadata() for file in files)
     except (OSError, pa.ArrowException) as fault:
-        raise InputError(f"{Path(out) / dataset}: is damaged ({fault}); run avtorch fleet again") from None
+        raise InputError(f"{folder}: is damaged ({fault}); run avtorch fleet again") from None

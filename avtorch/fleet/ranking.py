@@ -16,9 +16,9 @@ from datetime import UTC, datetime
 from statistics import fmean, pvariance
 from typing import Any
 
-from avtorch.fleet.folder import DATASETS, FleetFolder, Row, drive_belief
+from avtorch.fleet.folder import DATASETS, INTERVAL, QUANTITIES, STATS, Drive, FleetFolder, Row, drive_belief
 from avtorch.fleet.log_list import FleetLog, LogList
-from avtorch.fleet.settings import FleetSettings
+from avtorch.fleet.settings import FleetSettings, Step
 from avtorch.version import __version__
 
 SCHEMA = "avtorch.fleet/1"
@@ -28,8 +28,14 @@ APART = 0.05
 CHANGED = 3.0
 """Standard deviations between drives from which a car is said to differ from its past."""
 
+COMMON, SINGLE = 2 / 3, 1 / 3
+"""The model's: the 90 % interval of the share of cars is above the first. Single cars': below the second."""
+
 REASONS = ("below target", "failed", "changed", "unlike siblings", "gap", "sound", "no answer")
 """Why a car is where it is, in order."""
+
+Diagnosed = Mapping[str, Any]
+"""A drive's `named` causes, those `alike`, which its log cannot tell from them, and the `sizes` of the named."""
 
 
 def fleet_answer(found: LogList, folder: FleetFolder, settings: FleetSettings) -> dict[str, Any]:
@@ -37,30 +43,31 @@ def fleet_answer(found: LogList, folder: FleetFolder, settings: FleetSettings) -
     of_car: dict[str, list[FleetLog]] = {}
     for log in found.logs:
         of_car.setdefault(log.car, []).append(log)
-    cars = [_car(car, sorted(logs, key=_when), folder, settings) for car, logs in of_car.items()]
-    beliefs = {car["car"]: car.pop("beliefs") for car in cars}
+    cars: list[dict[str, Any]] = []
+    beliefs: dict[str, list[Drive]] = {}
+    diagnosed: dict[str, list[Diagnosed]] = {}
+    for name, logs in of_car.items():
+        car, beliefs[name], diagnosed[name] = _car(name, sorted(logs, key=_when), folder, settings)
+        cars.append(car)
+    has = {car: car_causes(drives) for car, drives in diagnosed.items() if drives}
+    causes = fleet_causes(has)
     common, beside = None, {}
-    if any(beliefs.values()):
-        from avtorch.fleet.population import population  # needs torch
+    if causes or any(beliefs.values()):
+        from avtorch.fleet.population import effect_sizes, population  # needs torch
 
         common, beside = population(beliefs)
-    diagnosed = {car["car"]: drives for car in cars if (drives := car.pop("diagnosed"))}
-    has = {car: car_causes(drives) for car, drives in diagnosed.items()}
-    causes = fleet_causes(has)
-    sizes: dict[str, dict[str, Any]] = {}
-    for cause in causes:
-        from avtorch.fleet.population import effect_sizes
-
-        name = cause["name"]
-        told = {car: [one["sizes"] for one in diagnosed[car]] for car, (named, _) in has.items() if name in named}
-        cause["parameters"], own = effect_sizes(name, told)
-        for car, values in own.items():
-            sizes.setdefault(car, {})[name] = values
+        for cause in causes:
+            name = cause["name"]
+            told = {car: [one["sizes"] for one in diagnosed[car]] for car, (named, _) in has.items() if name in named}
+            cause["parameters"], own = effect_sizes(name, told)
+            for car in cars:
+                if car["car"] in own:
+                    car["effects"][name] = own[car["car"]]
+    place = {}
     for car in cars:
         car["siblings"] = beside.get(car["car"])
-        car["effects"] = sizes.get(car["car"], {})
-        car["reason"] = _reason(car, settings.target)
-    cars.sort(key=_rank)
+        car["reason"], place[car["car"]] = _reason(car, settings.target)
+    cars.sort(key=lambda car: _rank(car, place[car["car"]]))
     elsewhere = folder.others(list(found.logs))
     notes = [f"The folder has rows of {elsewhere} more logs, which this call did not name."] if elsewhere else []
     failed = sum(bool(log["errors"]) for car in cars for log in car["logs"])
@@ -90,60 +97,56 @@ def _plain(x: Any) -> Any:
     return None if isinstance(x, float) and not math.isfinite(x) else x
 
 
-def _car(car: str, logs: Sequence[FleetLog], folder: FleetFolder, settings: FleetSettings) -> dict[str, Any]:
-    """What the rows say of a car; `logs` in order of time."""
-    drives = [_log(log, folder, settings) for log in logs]
-    past = [d for d in (one.pop("actuation") for one in drives) if d is not None]
-    diagnosed = [d for d in (one.pop("diagnosis") for one in drives) if d is not None]
+def _car(
+    name: str, logs: Sequence[FleetLog], folder: FleetFolder, settings: FleetSettings
+) -> tuple[dict[str, Any], list[Drive], list[Diagnosed]]:
+    """What the rows say of a car, and of its drives for all cars together; `logs` in order of time."""
+    drives, past, gaps, diagnosed = [], [], [], []
+    for log in logs:
+        drive, rows = _log(log, folder, settings)
+        drives.append(drive)
+        if used := [row for row in rows.get("estimate", ()) if row["used"]]:
+            past.append(_actuation(used))
+        for row in rows.get("diagnose", ()):
+            gaps.append(_gap(row))
+            diagnosed.append(_diagnosed(row))
     latest = past[-1] if past else None
-    found: dict[str, Any] = {"car": car, "reason": "no answer", "p_string_stable": None, "T_L": None, "K_L": None}
-    found |= {"change": None, "siblings": None, "effects": {}, "gap": None, "logs": drives}
-    found["beliefs"] = [one["log"] for one in past if one["log"] is not None]
-    found["diagnosed"] = [
-        {"named": _named(one), "alike": one.pop("alike"), "sizes": one.pop("sizes")} for one in diagnosed
-    ]
+    car: dict[str, Any] = {"car": name, "reason": "no answer", "p_string_stable": None, "T_L": None, "K_L": None}
+    car |= {"change": None, "siblings": None, "effects": {}, "gap": gaps[-1] if gaps else None, "logs": drives}
     if latest is not None:
         lowest = min(one["lowest"] for one in past)
-        found["p_string_stable"] = {"now": latest["p_string_stable"], "lowest": lowest}
-        found |= {name: latest[name]["belief"] for name in ("T_L", "K_L")}
+        car["p_string_stable"] = {"now": latest["p_string_stable"], "lowest": lowest}
+        car |= {quantity: latest[quantity]["belief"] for quantity in QUANTITIES}
         if len(past) > 1:
-            found["change"] = {name: _change([one[name] for one in past]) for name in ("T_L", "K_L")}
-    if diagnosed:
-        found["gap"] = diagnosed[-1]
-    return found
+            car["change"] = {quantity: _change([one[quantity] for one in past]) for quantity in QUANTITIES}
+    return car, [one["log"] for one in past if one["log"] is not None], diagnosed
 
 
-def _log(log: FleetLog, folder: FleetFolder, settings: FleetSettings) -> dict[str, Any]:
-    rows = {DATASETS[s]: folder.path(s, log).relative_to(folder.root).as_posix() for s in settings.steps}
-    out: dict[str, Any] = {"log": log.shown, "date": log.date, "tags": dict(log.tags), "errors": {}}
+def _log(log: FleetLog, folder: FleetFolder, settings: FleetSettings) -> tuple[dict[str, Any], dict[Step, list[Row]]]:
+    """A log's entry, and its rows of each step that was done."""
+    places = {DATASETS[s]: folder.path(s, log).relative_to(folder.root).as_posix() for s in settings.steps}
+    out: dict[str, Any] = {"log": log.shown, "date": log.date, "tags": dict(log.tags), "errors": {}, "rows": places}
     report = folder.report(log)
     there = "diagnose" in settings.steps and report.is_file()
-    out |= {"rows": rows, "report": report.relative_to(folder.root).as_posix() if there else None}
-    out |= {"actuation": None, "diagnosis": None}
-    for step in settings.steps:
-        read = folder.rows(step, log)
+    out["report"] = report.relative_to(folder.root).as_posix() if there else None
+    rows: dict[Step, list[Row]] = {step: folder.rows(step, log) for step in settings.steps}
+    for step, read in rows.items():
         if not read or read[0]["status"] != "done":
             out["errors"][step] = read[0]["error"] if read else "its rows are missing or damaged"
-        elif step == "estimate":
-            out["actuation"] = _actuation(read)
-        elif step == "diagnose":
-            out["diagnosis"] = _gap(read[0])
-    return out
+            rows[step] = []
+    return out, rows
 
 
-def _actuation(rows: Sequence[Row]) -> dict[str, Any] | None:
-    """T_L and K_L over the used windows of a log, and the last of them; None where there is none."""
-    used = [row for row in rows if row["used"]]
-    if not used:
-        return None
+def _actuation(used: Sequence[Row]) -> dict[str, Any]:
+    """T_L and K_L over the used windows of a log, and the last of them."""
     last = used[-1]
     out: dict[str, Any] = {"p_string_stable": last["p_string_stable"], "log": drive_belief(used)}
     out["lowest"] = min(row["p_string_stable"] for row in used)
-    for name in ("T_L", "K_L"):
+    for name in QUANTITIES:
         means = [row[f"{name}_mean"] for row in used]
         # what a drive's mean may vary by: windows differ by noise and by what the model lacks, and are not independent
         variance = pvariance(means) + fmean(row[f"{name}_sd"] ** 2 for row in used)
-        belief = {part: last[f"{name}_{part}"] for part in ("mean", "sd", "q05", "q95")}
+        belief = {part: last[f"{name}_{part}"] for part in STATS}
         out[name] = {"mean": fmean(means), "variance": variance, "belief": belief}
     return out
 
@@ -161,51 +164,51 @@ def _change(drives: Sequence[dict[str, Any]]) -> dict[str, float]:
 def _gap(row: Row) -> dict[str, Any]:
     causes = [
         {"name": c["name"], "probability": c["probability"]}
-        | {"share": None if c["share_mean"] is None else {p: c[f"share_{p}"] for p in ("mean", "q05", "q95")}}
+        | {"share": None if c["share_mean"] is None else {p: c[f"share_{p}"] for p in INTERVAL}}
         for c in row["causes"] or ()
     ]
-    # a pair's name is those of two with a plus between
-    aliases = [*(row["alias_set"] or ()), *(name for c in row["causes"] or () for name in c.get("alias_set") or ())]
-    alike = sorted({name for alias in aliases for name in alias.split("+")} - {"none", "unknown"})
-    unexplained = {part: row[f"unexplained_{part}"] for part in ("mean", "q05", "q95", "material")}
+    unexplained = {part: row[f"unexplained_{part}"] for part in (*INTERVAL, "material")}
     out = {"detected": row["gap_detected"], "before": row["gap_before"], "left": row["gap_left"]}
-    out |= {"verdict": row["verdict"], "causes": causes, "summary": row["summary"], "alike": alike}
-    out["sizes"] = {}
-    if row["causes"]:
-        from avtorch.fleet.population import drive_sizes
-
-        out["sizes"] = drive_sizes(row["causes"])
+    out |= {"verdict": row["verdict"], "causes": causes, "summary": row["summary"]}
     return out | {"unexplained": None if unexplained["mean"] is None else unexplained}
 
 
-def _named(gap: dict[str, Any]) -> list[str]:
-    """The causes of a diagnosis; `unknown` is one that has no name yet."""
-    return sorted({*gap["verdict"], *(cause["name"] for cause in gap["causes"])} - {"none"})
+def _diagnosed(row: Row) -> Diagnosed:
+    """What a diagnosis says for all cars together; `unknown` is a cause that has no name yet."""
+    causes, sizes = row["causes"] or (), {}
+    if causes:
+        from avtorch.fleet.population import drive_sizes
+
+        sizes = drive_sizes(causes)
+    # a pair's name is those of two with a plus between
+    aliases = [*(row["alias_set"] or ()), *(name for cause in causes for name in cause.get("alias_set") or ())]
+    alike = sorted({name for alias in aliases for name in alias.split("+")} - {"none", "unknown"})
+    named = sorted({*row["verdict"], *(cause["name"] for cause in causes)} - {"none"})
+    return {"named": named, "alike": alike, "sizes": sizes}
 
 
-def _reason(car: dict[str, Any], target: float) -> str:
-    stable, change, gap = car["p_string_stable"], car["change"], car["gap"]
+def _reason(car: dict[str, Any], target: float) -> tuple[str, float]:
+    """Why a car is where it is, and its place among cars of that reason, the first the lowest."""
+    stable, change, siblings, gap = (car[key] for key in ("p_string_stable", "change", "siblings", "gap"))
     if stable is not None and stable["now"] < target:
-        return "below target"
+        return "below target", stable["now"]
     if any(log["errors"] for log in car["logs"]):
-        return "failed"
-    if change is not None and max(one["in_sd"] for one in change.values()) >= CHANGED:
-        return "changed"
-    if car["siblings"] is not None and car["siblings"]["q_value"] <= APART:
-        return "unlike siblings"
-    if gap is not None and gap["verdict"] != ["none"]:
-        return "gap"
-    return "sound" if stable is not None or gap is not None else "no answer"
-
-
-def _rank(car: dict[str, Any]) -> tuple[Any, ...]:
-    stable, change, gap = car["p_string_stable"], car["change"], car["gap"]
-    probability = 1.0 if stable is None else stable["now"]
+        return "failed", 0.0
     changed = 0.0 if change is None else max(one["in_sd"] for one in change.values())
+    if changed >= CHANGED:
+        return "changed", -changed
+    if siblings is not None and siblings["q_value"] <= APART:
+        return "unlike siblings", min(siblings[name]["tail"] for name in QUANTITIES)
+    if gap is not None and gap["verdict"] != ["none"]:
+        return "gap", 0.0
+    return "no answer" if stable is None and gap is None else "sound", 0.0
+
+
+def _rank(car: dict[str, Any], place: float) -> tuple[Any, ...]:
+    stable, gap = car["p_string_stable"], car["gap"]
     size = 0.0 if gap is None or gap["before"] is None else gap["before"]
-    apart = 1.0 if car["siblings"] is None else min(car["siblings"][name]["tail"] for name in ("T_L", "K_L"))
-    order = {"below target": probability, "changed": -changed, "unlike siblings": apart}.get(car["reason"], 0.0)
-    return REASONS.index(car["reason"]), order, -size, probability, car["car"]
+    probability = 1.0 if stable is None else stable["now"]
+    return REASONS.index(car["reason"]), place, -size, probability, car["car"]
 
 
 def _when(log: FleetLog) -> tuple[bool, datetime, str]:
@@ -214,13 +217,6 @@ def _when(log: FleetLog) -> tuple[bool, datetime, str]:
         return False, datetime.min.replace(tzinfo=UTC), os.path.basename(log.place)
     date = datetime.fromisoformat(log.date)
     return True, date if date.tzinfo is not None else date.replace(tzinfo=UTC), log.place
-
-
-COMMON, SINGLE = 2 / 3, 1 / 3
-"""The model's: the 90 % interval of the share of cars is above the first. Single cars': below the second."""
-
-Diagnosed = Mapping[str, Any]
-"""A drive's `named` causes, and those `alike`, which its log cannot tell from them."""
 
 
 def car_causes(drives: Sequence[Diagnosed]) -> tuple[list[str], list[str]]:

@@ -91,7 +91,9 @@ def run_fleet(
     with sole_use(out, work="a fleet"):
         tasks, kept, notes = _plan(found.logs, folder, given, retry=retry, report=report, progress=steps)
         if tasks:
-            with connected(min(workers or _cores(), len(tasks)), memory, scheduler) as cluster:
+            from dask.system import CPU_COUNT
+
+            with connected(min(workers or CPU_COUNT, len(tasks)), memory, scheduler) as cluster:
                 if connected_to is not None:
                     connected_to(cluster)
                 cost, of, failed = 0, sum(_COST[task.step] for task in tasks), 0
@@ -158,7 +160,3 @@ def _content(log: FleetLog) -> tuple[str, int] | str:
             return content_hash(local)
     except (InputError, OSError) as fault:
         return str(fault)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

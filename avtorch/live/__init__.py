@@ -6,7 +6,7 @@ Example:
     >>> watch = LiveWatch(LiveSettings(window=2.0, estimator="map"))
     >>> parser = LineParser(watch.counts)
     >>> class Lines:
-    ...     name, identity = "lines", None
+    ...     identity = None
     ...     def batches(self, stop, start=None):
     ...         line = '{"car": "red", "time": %g, "accel_cmd": 0.1, "speed": %g}'
     ...         rows = [parser.row((line % (0.02 * i, 20.0 + 0.002 * i)).encode()) for i in range(120)]

@@ -367,7 +367,6 @@ class LiveWatch:
         self.settings = LiveSettings() if settings is None else settings
         self.counts = Counts() if counts is None else counts
         self.cars: dict[str, LiveCar] = {}
-        self._warm: set[type[Form]] = set()
 
     def take(self, batch: Batch) -> list[Answer]:
         """Take in a batch; returns what is to be said, in the order of the rows that ended the windows."""
@@ -385,27 +384,10 @@ class LiveWatch:
     def _new(self, row: Row) -> LiveCar | None:
         """The watch of a car that has not been seen before; None, and counted, where there can be none."""
         signals = {name for name, value in row.signals.items() if value is not None}
-        form = self.settings.form_of(signals)
-        if form is None:
+        if self.settings.form_of(signals) is None:
             self.counts.refuse("incomplete")
             return None
         if len(self.cars) >= self.settings.cars:
             self.counts.refuse("too many cars")
             return None
-        self.warm_up(form)
         return self.cars.setdefault(row.car, LiveCar(row.car, signals, self.settings, self.counts))
-
-    def warm_up(self, form: Form) -> None:
-        """Compile what the estimator needs before the first window depends on it, once a form."""
-        if type(form) in self._warm:
-            return
-        self._warm.add(type(form))
-        time = 0.02 * torch.arange(round(2.5 * self.settings.window / 0.02), dtype=torch.float64)
-        command = 3.0 * torch.sin(2.0 * time)
-        # the exact answer of a car of lag 0.5 s to a sine, behind its transient
-        accel = 0.5 * (command - 3.0 * torch.cos(2.0 * time))
-        noise = 0.05 * torch.randn(3, len(time), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-        rows = {"accel_cmd": command, "accel": accel + noise[0], "jerk": 2.0 * (command - accel) + noise[1]}
-        rows["speed"] = 20.0 - 0.75 * (torch.cos(2.0 * time) + torch.sin(2.0 * time)) + noise[2]
-        needed = {name: rows[name] for name in form.columns}
-        self.settings.watch("", form).feed(time, needed, self.settings.setting())

@@ -116,7 +116,6 @@ class MqttSource:
 
     def __init__(self, address: MqttAddress, parser: LineParser, *, client_id: str | None = None) -> None:
         self.address, self.parser = address, parser
-        self.name = address.name
         self._rows: list[Row] = []
         self._refused: str | None = None
         self._client = _client(address, client_id)
@@ -135,7 +134,7 @@ class MqttSource:
                     if fault or not had or self._client.loop(0.0) or len(self._rows) == had:
                         break
                 if self._refused is not None:
-                    raise InputError(f"{self.name}: the broker refuses ({self._refused})")
+                    raise InputError(f"{self.address.name}: the broker refuses ({self._refused})")
                 rows, self._rows = self._rows, []
                 yield Batch(rows)
                 if fault:
@@ -179,41 +178,26 @@ class MqttSink:
         if any(mark in address.topic for mark in "+#"):
             raise InputError(f"{address.name}: answers need one topic, without + and #")
         self.address, self._stop = address, Event() if stop is None else stop
-        self._sent = self._acknowledged = 0
-        self._changed = threading.Condition()
+        self._free = threading.Semaphore(UNACKNOWLEDGED)
         self._client = _client(address, None)
-        self._client.on_publish = self._on_publish
+        self._client.on_publish = lambda *_: self._free.release()
         _connect(self._client, address)
         self._client.loop_start()
 
-    @property
-    def unsent(self) -> int:
-        """Answers that the broker has not acknowledged."""
-        return self._sent - self._acknowledged
-
     def write(self, answer: Answer) -> bool:
         """Send; waits while too many answers are on their way, until the watch is stopped."""
-        self._wait(lambda: self.unsent < UNACKNOWLEDGED or self._stop.is_set())
+        while not self._free.acquire(blocking=False) and not self._stop.wait(_WAIT_S):
+            pass
         self._client.publish(self.address.topic, line_of(answer).strip(), qos=1)
-        self._sent += 1
         return True
 
     def flush(self) -> None:
         """Nothing: the client sends by itself."""
 
     def close(self) -> None:
-        """Wait a little for the last answers, then disconnect; `unsent` tells what was not acknowledged."""
+        """Wait a little for the last answers to be acknowledged, then disconnect."""
         end = time.monotonic() + CLOSE_S
-        self._wait(lambda: self.unsent <= 0 or time.monotonic() > end)
+        for _ in range(UNACKNOWLEDGED):
+            self._free.acquire(timeout=max(0.0, end - time.monotonic()))
         self._client.disconnect()
         self._client.loop_stop()
-
-    def _wait(self, until: Any) -> None:
-        with self._changed:
-            while not until():
-                self._changed.wait(_WAIT_S)
-
-    def _on_publish(self, client: Any, userdata: Any, mid: int, code: Any, properties: Any) -> None:
-        with self._changed:
-            self._acknowledged += 1
-            self._changed.notify_all()

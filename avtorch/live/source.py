@@ -54,11 +54,6 @@ class Source(Protocol):
     """Where rows come from."""
 
     @property
-    def name(self) -> str:
-        """For messages."""
-        ...
-
-    @property
     def identity(self) -> str | None:
         """What a position belongs to; None where the source cannot be read again."""
         ...
@@ -178,18 +173,29 @@ class LineParser:
         if type(found) is not dict:
             return self._refused("corrupt")
         car = found.get("car", car)
-        if type(car) is not str:
-            if type(car) is not int:
-                return self._refused("corrupt")
+        if type(car) is int:
             car = str(car)
+        if type(car) is not str:
+            return self._refused("corrupt")
         time = found.get(self._time)
         if time is None:
             return self._refused("incomplete")
         # as false as text: a number in quotation marks is one that somebody meant to be a word
         if type(time) not in (float, int) or not -1e15 < time < 1e15:
             return self._refused("implausible")
+        if not 0 < len(car) <= _CAR:
+            return self._refused("corrupt")
         signals = {name: found[column] for name, column in self._columns if column in found}
-        return self._made(car, float(time), signals)
+        try:
+            car.encode()  # JSON may hold half of a surrogate pair
+            for name, factor in self._factors.items():
+                if signals.get(name) is not None:
+                    signals[name] *= factor
+        except UnicodeEncodeError:
+            return self._refused("corrupt")
+        except (TypeError, OverflowError):  # an integer of four hundred digits is no float
+            return self._refused("implausible")
+        return Row(car, time * self._second, signals)
 
     def _of_csv(self, line: bytes) -> Row | None:
         try:
@@ -215,21 +221,6 @@ class LineParser:
                 "and accel or speed (--map names other columns)"
             )
         return cells
-
-    def _made(self, car: str, time: float, signals: dict[str, Any]) -> Row | None:
-        try:
-            car.encode()  # JSON may hold half of a surrogate pair
-        except UnicodeEncodeError:
-            return self._refused("corrupt")
-        if not car or len(car) > _CAR:
-            return self._refused("corrupt")
-        try:
-            for name, factor in self._factors.items():
-                if signals.get(name) is not None:
-                    signals[name] *= factor
-        except (TypeError, OverflowError):  # an integer of four hundred digits is no float
-            return self._refused("implausible")
-        return Row(car, time * self._second, signals)
 
     def _refused(self, kind: str) -> None:
         self.counts.refuse(kind)
@@ -274,7 +265,6 @@ class _Lines:
 class StreamSource:
     """Lines of an open descriptor, standard input by default, until it ends."""
 
-    name = "standard input"
     identity = None
 
     def __init__(self, parser: LineParser, descriptor: int = 0) -> None:
@@ -303,10 +293,6 @@ class FileSource:
         self.path, self.parser, self.follow = Path(path), parser, follow
         self._file: BinaryIO | None = None
         self._opened().close()
-
-    @property
-    def name(self) -> str:
-        return str(self.path)
 
     @property
     def identity(self) -> str | None:
@@ -394,7 +380,7 @@ class PlayedLog:
         log = Log.read(path, map=map, unit=unit)
         if log.accel_cmd is None:
             raise no_command(log, "; T_L and K_L need the demanded acceleration")
-        self.name, self.rate = str(path), rate
+        self.rate = rate
         self.car = Path(path).stem if car is None else car
         signals = [(name, getattr(log, name)) for name in SIGNALS]
         self._signals = {name: values for name, values in signals if values is not None}

@@ -1,4 +1,4 @@
-"""`avtorch diagnose`: what it passes on, prints and writes, how it resumes, and one line for input it cannot use.
+"""`avtorch diagnose`: what it passes on, prints and writes, and one line for input it cannot use.
 
 The search has its own tests; here a stub replaces it.
 """
@@ -200,9 +200,6 @@ def test_json_and_quiet(search: Search, drive: str, tmp_path: Path, capsys: pyte
     assert json.loads(said.out) == {key: written[key] for key in written if key != "files"}
     assert main(["diagnose", drive, "--quiet", "--out", str(tmp_path / "o")]) == 0
     assert capsys.readouterr() == ("", "")
-
-
-# --- interrupted, and on again
 
 
 # --- bad input

@@ -33,6 +33,7 @@ def test_answer_and_page(log: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "headway" in said
     assert "P(string stable)" in said
     assert said.startswith("Assuming a constant time gap")
+    assert set(answer["files"]) == {p.name for p in out.glob("[!.]*")} - {"diagnosis.json"}, "all of one set"
     assert not (out / "manoeuvre.csv").exists()
     assert "The loop" in (out / "report.html").read_text(encoding="utf-8")
 

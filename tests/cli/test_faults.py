@@ -1,7 +1,9 @@
 """Faults while a command writes: each file is whole, of the earlier answer or the new; a mixed set is recognised.
 
 Stubs replace computation and drawing, so that a command runs in milliseconds and its writing can fail at every call;
-argument parsing, checks and writing are the command's own. `of` selects one of two answers of the stubs.
+argument parsing, checks and writing are the command's own. `of` selects one of two answers of the stubs. The commands
+not here write by the same `answer_set`, of which `io/test_answer_set.py` sweeps every call: their tests show that all
+their files are of one set.
 """
 
 from __future__ import annotations
@@ -9,7 +11,6 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -18,29 +19,19 @@ import numpy as np
 import pytest
 
 import avtorch.decision.estimation
-import avtorch.decision.supervisor
 import avtorch.experiment
-import avtorch.follower
 import avtorch.gap.compare
-import avtorch.paper
 import avtorch.plots.style
 import avtorch.report
 import avtorch.report.comparison
 import avtorch.report.diagnosis
 import avtorch.report.estimates
-import avtorch.report.run
-import avtorch.report.validation
 import avtorch.results
-import avtorch.validation
 import avtorch.vehicle.stability
 from avtorch.cli import main
 from avtorch.gap import DeadTime, plant
-from avtorch.report.table import Table
 from tests.cli.test_diagnose import answer, columns, write
-from tests.faulty_disk import disk, fails, interrupts, old_or_new, tree, visible
-
-STATE = frozenset({"fits.json", "fits_of.json"})
-"""Files kept for resuming; they belong to no answer."""
+from tests.faulty_disk import disk, fails, old_or_new, tree, visible
 
 
 class Command:
@@ -81,14 +72,6 @@ def stability(c: Command) -> None:
     c.once(avtorch.vehicle.stability, "region")
 
 
-def run(c: Command) -> None:
-    line = ["run", "--duration", "4", "--change-at", "2", "--strategy", "none"]
-    c.lines = {"old": [*line, "--seed", "1"], "new": [*line, "--seed", "2"]}
-    c.once(avtorch.vehicle.Leader, "default")
-    c.once(avtorch.decision.supervisor.Supervisor, "run")
-    c.stand_in(avtorch.report.run, "run_html", lambda *_, **__: f"page of {c.of}")
-
-
 def estimate(c: Command) -> None:
     line = ["estimate", write(c.tmp_path / "drive.csv", **columns()), "--estimator", "map"]
     c.lines = {"old": line, "new": [*line, "--tau", "1.2"]}
@@ -110,32 +93,6 @@ def diagnose(c: Command) -> None:
     c.stand_in(sys.modules["avtorch.report.diagnosis"], "report_html", lambda *_, **__: f"page of {c.of}")
 
 
-@dataclass(frozen=True)
-class Followed:
-    """The parts of a follower's diagnosis that the command needs."""
-
-    of: str
-    diagnosis: Any
-    conditional: tuple[str, ...] = ()
-    parameters: dict[str, Any] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"of": self.of}
-
-    def sentences(self) -> list[str]:
-        return [self.of]
-
-
-def follower(c: Command) -> None:
-    time = columns()["time"]
-    signals = {"time": time, "speed": 15 + np.sin(time), "spacing": 30 - np.sin(time), "lead_speed": 15 + np.cos(time)}
-    line = ["diagnose", write(c.tmp_path / "follower.csv", **signals), "--follower"]
-    c.lines = {"old": line, "new": line}
-    given = {"old": {"plant": plant([DeadTime(0.182)])}, "new": {"plant": None}}
-    c.stand_in(avtorch.follower, "diagnose_follower", lambda log, **_: Followed(c.of, answer([log], **given[c.of])))
-    c.stand_in(sys.modules["avtorch.report.diagnosis"], "report_html", lambda *_, **__: f"page of {c.of}")
-
-
 def comparison(c: Command) -> None:
     log = write(c.tmp_path / "drive.csv", **columns())
     c.lines = {of: ["compare", log, log] for of in ("old", "new")}
@@ -144,54 +101,8 @@ def comparison(c: Command) -> None:
     c.stand_in(avtorch.report.comparison, "comparison_html", lambda *_, **__: f"page of {c.of}")
 
 
-class Netcdf:
-    """Written by a library that raises its own errors."""
-
-    def __init__(self, text: str) -> None:
-        self.text = text
-
-    def to_netcdf(self, path: str) -> None:
-        try:
-            Path(path).write_text(self.text, encoding="utf-8")
-        except OSError as fault:
-            raise RuntimeError(f"NetCDF: HDF error: {fault}") from None
-
-
-def validate(c: Command) -> None:
-    """The new answer has no quadrature, hence fewer files."""
-    c.lines = {of: ["validate", "--synthetic", "--windows", "1"] for of in ("old", "new")}
-    names = {"old": ("sgld", "nuts", "quadrature"), "new": ("sgld", "nuts")}
-    pictures = {"old": ("marginals.png", "ecdf.png"), "new": ("marginals.png",)}
-    told = SimpleNamespace(
-        to_arviz=lambda: {name: Netcdf(f"{name} of {c.of}") for name in names[c.of]},
-        verdict=SimpleNamespace(agree=True),
-    )
-    c.once(avtorch.validation, "synthetic_windows")
-    c.stand_in(sys.modules["avtorch.validation.validate"], "check_installed", lambda: None)
-    c.stand_in(avtorch.validation, "validate", lambda *_, **__: told)
-    c.stand_in(avtorch.results, "validation_answer", lambda _: {"verdict": "agree", "why": c.of})
-    c.stand_in(avtorch.report.validation, "validation_html", lambda *_, **__: f"page of {c.of}")
-    c.stand_in(avtorch.plots, "validation_figures", lambda _: {x: lambda x=x: f"{x} of {c.of}" for x in pictures[c.of]})
-    c.stand_in(avtorch.report.validation, "validation_table", lambda _: Table("", ("",), ()))
-    c.stand_in(avtorch.report.validation, "validation_notes", lambda _: ())
-
-
-def paper(c: Command) -> None:
-    """The new answer is of one experiment only."""
-    c.lines = {"old": ["paper", "all"], "new": ["paper", "gains"]}
-    pictures = {"old": ("gains.png", "platoon.png", "strategies_speed.png"), "new": ("gains.png",)}
-    c.monkeypatch.delenv("AVTORCH_DATA", raising=False)
-    c.once(avtorch.vehicle.Leader, "default")
-    told = SimpleNamespace(answer=lambda: {"of": c.of, "leaders": {}}, found={})
-    c.stand_in(avtorch.paper, "reproduce", lambda *_, **__: told)
-    c.stand_in(avtorch.plots, "paper_pictures", lambda _: {x: lambda x=x: f"{x} of {c.of}" for x in pictures[c.of]})
-    for name in ("counts_table", "rows_table"):
-        c.stand_in(sys.modules["avtorch.cli.paper"], name, lambda _: Table("", ("",), ()))
-    c.stand_in(sys.modules["avtorch.cli.paper"], "missed", lambda _: ())
-
-
 QUICK = [stability, comparison]
-COMMANDS = [*QUICK, run, estimate, diagnose, follower, validate, paper]
+COMMANDS = [*QUICK, estimate, diagnose]
 
 
 @pytest.fixture(
@@ -221,11 +132,11 @@ class Answers:
         self.followed: set[tuple] = set()
 
     def seen(self) -> dict[str, str]:
-        return visible(self.command.out, besides=STATE)
+        return visible(self.command.out)
 
     def judge(self) -> str:
         """`old`, `new`, or `mixed`, which is recognised."""
-        return old_or_new(self.command.out, self.json, self.old, self.new, besides=STATE)
+        return old_or_new(self.command.out, self.json, self.old, self.new)
 
     def again(self) -> None:
         shutil.rmtree(self.command.out)
@@ -290,24 +201,3 @@ def test_a_reader_at_any_moment_and_a_kill(command: Command) -> None:
         shutil.rmtree(command.out)
         (killed / str(n)).rename(command.out)
         answers.follow()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", [diagnose], indirect=True, ids=["diagnose"])
-def test_an_interruption_at_the_nth_call(command: Command, capsys: pytest.CaptureFixture[str]) -> None:
-    answers = Answers(command)
-    for n in range(1, 2000):
-        capsys.readouterr()
-        with disk(command.out, interrupts(n), reads=False) as calls:
-            code = command.run("new")
-        said = capsys.readouterr().err
-        assert code == (0 if said == "" else 130)
-        if said == "":
-            assert answers.seen() == answers.new
-        else:
-            assert answers.judge() in ("old", "mixed", "new")
-        answers.follow()
-        answers.again()
-        if len(calls) < n:
-            return
-    raise AssertionError("the sweep has no end")

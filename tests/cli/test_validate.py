@@ -6,11 +6,14 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import ANY
 
 import pytest
 
 from avtorch.cli import main
+from avtorch.cli.validate import export
+from avtorch.errors import InputError
 from avtorch.io import read_answer
 from avtorch.report.validation import validation_notes, validation_table
 
@@ -46,6 +49,7 @@ def test_synthetic_windows(short_nuts: None, tmp_path: Path, capsys: pytest.Capt
     assert {"validation.json", "sgld.nc", "nuts.nc", "quadrature.nc", *pictures} <= written
     answer = json.loads((out / "validation.json").read_text(encoding="utf-8"))
     assert answer["schema"] == "avtorch.validation/1"
+    assert set(answer["files"]) == {name for name in written if not name.startswith(".")} - {"validation.json"}
     summary = answer["summary"]
     assert summary["windows"] == 3
     assert all(finite_numbers(summary[k]) for k in ("mean_difference_sd_p95", "sd_ratio_p025", "sd_ratio_p975"))
@@ -108,6 +112,16 @@ def test_missing_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused:
 
     monkeypatch.setattr(sys.modules["avtorch.validation.validate"], "find_spec", lambda name: None)
     assert "pip install 'avtorch[validate]'" in refused(["validate", "--synthetic", "--out", str(tmp_path)])
+
+
+def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
+    """NetCDF's libraries raise errors of their own."""
+
+    def full(path: str) -> None:
+        raise RuntimeError("NetCDF: HDF error")
+
+    with pytest.raises(InputError, match=r"sgld\.nc: cannot be written \(NetCDF: HDF error\)"):
+        export(tmp_path, {"sgld": SimpleNamespace(to_netcdf=full)})  # type: ignore[dict-item]
 
 
 def test_table_of_a_latent_log_names_its_parameter() -> None:

@@ -15,10 +15,10 @@ import pytest
 
 import avtorch
 from avtorch.errors import InputError
-from avtorch.fleet import FleetSettings, read_rows, run_fleet
+from avtorch.fleet import FleetLog, FleetSettings, read_rows, run_fleet
 from avtorch.fleet import task as tasks
-from avtorch.fleet.folder import schema
-from avtorch.fleet.log_list import FleetLog, key_of
+from avtorch.fleet.folder import FleetFolder, schema
+from avtorch.fleet.log_list import key_of
 from avtorch.io import Log
 from avtorch.results import window_entry
 from tests.bars import BAR
@@ -279,6 +279,43 @@ def test_the_sizes_of_a_cause_are_pooled_over_cars_that_were_diagnosed(
         assert ends.min() - 0.1 * sds.min() < own["median"] < ends.max() + 0.1 * sds.min()
         # and no further off than the worse drive says
         assert abs(own["median"] - delay) < BAR * sds.max()
+
+
+def test_a_report_goes_with_its_answer(tmp_path: Path) -> None:
+    folder, log = FleetFolder(tmp_path), FleetLog("a.csv", "../red car")
+    done: list[dict[str, Any]] = [{"verdict": ["none"]}]
+    folder.write("diagnose", log, "key", done, sha256="0", seconds=0.0, report="<p>page</p>")
+    assert folder.report(log).read_text() == "<p>page</p>"
+    # the manifest names another car since
+    other = replace(log, car="blue")
+    assert folder.kept("diagnose", other, "key") == "done"
+    assert [row["car"] for row in folder.rows("diagnose", other)] == ["blue"]
+    assert folder.report(other).read_text() == "<p>page</p>"
+    folder.write("diagnose", other, "key", done, sha256="0", seconds=0.0)
+    assert not folder.report(other).exists()
+
+
+@pytest.mark.slow
+def test_reports_are_written_by_the_worker_and_made_where_missing(tmp_path: Path, scheduler: str) -> None:
+    for car, lag in {"red": 0.4, "blue": 0.3}.items():
+        (tmp_path / "logs" / car).mkdir(parents=True)
+        drive(lag, seconds=14.0).write(tmp_path / "logs" / car / "drive.csv")
+    settings = FleetSettings(steps=("diagnose",), effects=("dead_time",), pairs=False, posterior="laplace")
+
+    def fleet(**more: Any) -> dict[str, Any]:
+        return run_fleet(tmp_path / "logs", tmp_path / "out", settings=settings, scheduler=scheduler, **more)
+
+    plain = fleet()
+    assert plain["failed_logs"] == 0
+    assert [log["report"] for car in plain["cars"] for log in car["logs"]] == [None, None]
+    full = fleet(report=str)
+    assert full["work"]["computed"] == 2
+    for car in full["cars"]:
+        (log,) = car["logs"]
+        assert log["report"].startswith("reports/drive-")
+        assert (tmp_path / "out" / log["report"]).read_text().startswith(car["gap"]["summary"])
+    assert fleet(report=str)["work"]["computed"] == 0
+    assert fleet()["cars"] == full["cars"]
 
 
 def test_logs_by_url(tmp_path: Path, scheduler: str) -> None:

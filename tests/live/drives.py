@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import time
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -38,3 +40,11 @@ def fleet(seconds: float = 12.0, cars: dict[str, tuple[float, float]] | None = N
 
 def lines(rows: list[dict[str, Any]]) -> bytes:
     return "".join(json.dumps(row) + "\n" for row in rows).encode()
+
+
+def until(what: Callable[[], object]) -> None:
+    """Wait until `what` gives something; the bar is for a machine with other work."""
+    end = time.monotonic() + 60
+    while not what():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)

@@ -19,7 +19,7 @@ import pytest
 from avtorch.cli import main
 from avtorch.cli.watch import host_and_port
 from avtorch.errors import InputError
-from tests.live.drives import drive, fleet, lines
+from tests.live.drives import drive, fleet, lines, until
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -35,15 +35,6 @@ def started(here: Path, *arguments: str, **options: Any) -> subprocess.Popen[byt
     command = [sys.executable, "-m", "avtorch.cli", "watch", *arguments]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(command, cwd=here, env=environment, stderr=subprocess.PIPE, **options)
-
-
-def until(what: Any, seconds: float = 60.0) -> Any:
-    """What `what` gives, once it gives something; the bar is for a machine with other work."""
-    end = time.monotonic() + seconds
-    while not (found := what()):
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
-    return found
 
 
 def test_a_line_a_window_and_a_count_at_the_end(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -156,7 +147,7 @@ def test_metrics_are_served_while_it_runs(here: Path, capsys: pytest.CaptureFixt
     pages = []
 
     class Lines:
-        name, identity = "lines", None
+        identity = None
 
         def batches(self, stop, start=None):
             for line in [*lines(fleet(4.2)).splitlines(), b"{"]:

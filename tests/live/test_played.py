@@ -73,18 +73,11 @@ def test_a_bag_gives_the_windows_of_its_rows(
 @pytest.mark.usefixtures("in_this_process")
 def test_it_goes_on_at_the_row_where_it_stopped(tmp_path: Path) -> None:
     path, told = parquet(tmp_path / "drive.parquet"), io.StringIO()
-
-    class Ends:
-        def __init__(self, stop: Event) -> None:
-            self.stop = stop
-
-        def answered(self, answer, car, seconds) -> None:
-            self.stop.set()
-
     for _ in range(3):
         watch, stop, source = LiveWatch(), Event(), PlayedLog(path, rate=100.0)
         kept = KeptCars(tmp_path / "state", source.identity)
-        watch_source(source, watch, [LineSink(told)], stop=stop, kept=kept, answered=Ends(stop).answered)
+        end = lambda *_, stop=stop: stop.set()  # noqa: E731
+        watch_source(source, watch, [LineSink(told)], stop=stop, kept=kept, answered=end)
     whole = io.StringIO()
     watch_source(PlayedLog(path), LiveWatch(), [LineSink(whole)])
     assert told.getvalue().splitlines() == whole.getvalue().splitlines()[:2]
