@@ -76,8 +76,7 @@ class Part:
     plausible: bool = True
 
     def to_dict(self) -> dict[str, Any]:
-        out = of_fields(self)
-        del out["share"]["sd"]
+        out = of_fields(self, intervals=True)
         return {"names": [out.pop("name")]} | out
 
 

@@ -264,18 +264,11 @@ def candidates_of(
         parameters: dict[str, Quantity] = {} if label == "none" or p < LEAST_LISTED else own.named()
         moved = own.moved()
         odd = implausible(parameters, moved, [k for k in kinds if k.name in label.split("+")])
-        onset = None if label == "none" else first_onset(weight, label.split("+"))
-        out.append(
-            Candidate(
-                label,
-                p,
-                float(weight.evidence - none),
-                parameters,
-                {} if label == "none" else moved,
-                None if onset is None else onset.stamp_s,
-                odd,
-            )
-        )
+        if label == "none":
+            moved = {}
+        onset = first_onset(weight, label.split("+"))
+        began = None if onset is None else onset.stamp_s
+        out.append(Candidate(label, p, float(weight.evidence - none), parameters, moved, began, odd))
     return out, posteriors
 
 
