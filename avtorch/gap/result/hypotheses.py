@@ -337,7 +337,6 @@ class AnswerPart:
 
     `size_mps2`: root mean square of what it adds to the acceleration or to the rate of the speed, None where that is
     not measured. `where` a free form acts, in time, speed, command, frequency.
-
     """
 
     name: str | None
@@ -397,9 +396,9 @@ def parts_of(
         if name not in ("none", "unknown")
     ]
     present = min(sum(average.force_maps.values()), 1.0)  # which rounding may exceed
-    weight = _with_map(average, posterior.weight)
-    if weight is not None and present >= LEAST_LISTED:
-        h = weight.examined.hypothesis
+    having = [w for w in average.best.values() if w.examined.hypothesis.force is not None]
+    if having and present >= LEAST_LISTED:
+        h = max(having, key=lambda w: (w is posterior.weight, w.log_weight)).examined.hypothesis
         form = max(average.force_maps, key=lambda name: average.force_maps[name])
         parts.append(AnswerPart(None, "force map", form, map_size(h, seed), present))
     for form, probability in sorted(average.parts.items(), key=lambda kv: -kv[1]):
@@ -439,14 +438,6 @@ def map_size(h: Hypothesis, seed: int = 0) -> Quantity:
     random = np.random.default_rng(seed).standard_normal((_DRAWS, n))
     draws = b + random * np.sqrt(np.maximum(sizes, 0.0)) @ turn.T
     return Quantity.of_draws(np.sqrt(np.einsum("dk,kl,dl->d", draws, h.force.gram, draws)))
-
-
-def _with_map(average: ModelAverage, weight: Weight) -> Weight | None:
-    """The weight, or else the strongest of the average, that has a force map."""
-    having = [w for w in average.best.values() if w.examined.hypothesis.force is not None]
-    if weight.examined.hypothesis.force is not None:
-        return weight
-    return max(having, key=lambda w: w.log_weight, default=None)
 
 
 def _size(posterior: ParameterPosterior, name: str) -> Quantity | None:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
@@ -158,7 +158,7 @@ class Domain:
         """`given` as a float, an int or a tuple. Raises an `InputError` that begins with `where`."""
         if not self.most:
             return self._number(where, given)
-        each: list[Any] | None = given if isinstance(given, list) else None
+        each = cast("list[Any] | None", given if isinstance(given, list) else None)
         if each is None or not self.least <= len(each) <= self.most:
             what = _found(given) if each is None else f"a list of {len(each)} values"
             raise InputError(f"{where}: found {what}, needs a list of {self.least} to {self.most} numbers")
