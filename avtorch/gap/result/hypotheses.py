@@ -333,8 +333,9 @@ def given_dead_time(
 # parts --------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class AnswerPart:
-    """A part of what the simulator lacks: `name` of an effect, None of a free form; its `family`; `form` of a free one.
+    """A part of what the simulator lacks, an entry of `parts` in `diagnosis.json`.
 
+    `name` of an effect, None of a free form; its `family`; `form` of a free one.
     `size_mps2`: root mean square of what it adds to the acceleration or to the rate of the speed, None where that is
     not measured. `where` a free form acts, in time, speed, command, frequency.
     """
@@ -345,10 +346,6 @@ class AnswerPart:
     size_mps2: Quantity | None
     probability: float
     where: tuple[Location, ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """An entry of `parts` in `diagnosis.json`."""
-        return of_fields(self)
 
 
 @dataclass(frozen=True, eq=False)
