@@ -65,7 +65,6 @@ class Diagnosis(Displayed, sentences.Findings):
       row, the time scale of `gain_change` in `plant`
     - `complete` False: the budget ended the search; `scope`: what was tried, None where unknown. Where that is not
       everything, probabilities cover what was tried, and `unknown` includes the causes that were not
-
     - `alarms`: what `avtorch estimate` raised on these drives, where that was given; it is drawn and changes nothing
 
     The verdict is the budget's where there is one, else the most probable hypothesis.
