@@ -206,13 +206,13 @@ def diagnose(
         alias_set=tuple(dict.fromkeys([*said.alias_set, *others])),
         why=f"{said.why} {said_of_unnamed(parts, said.abstained, each[0].epoch_s)}".strip(),
     )
-    attribution = row_attribution(rows, best, none)
+    errors = [rows.errors(h) for h in (none, best, repaired.examined.hypothesis)]
+    attribution = row_attribution(rows, best, none, (errors[0] - errors[1]).mean(-1))
     onset = None
     if names != ("none",):
         onset = first_onset(weight if named else top, names if named else top.label.split("+"))
     since = None if onset is None else onset.stamp_s - each[onset.log].epoch_s
     scope = _scope(inference, shown, data.channels, pairs)
-    errors = [rows.errors(h) for h in (none, best, repaired.examined.hypothesis)]
     after = errors[2] if named else errors[0]
     if free is not None:
         after = rows.errors(free.lagged, free.without([]))

@@ -63,8 +63,8 @@ class Diagnosis(Displayed, sentences.Findings):
     - `remaining`: with the default baseline, the hypotheses given that `dead_time` is in the simulator
     - `onset_s`: onset of the effect, on the own clock of log number `onset_log`; `onset_from_start_s`: from its first
       row, the time scale of `gain_change` in `plant`
-    - `complete` False: the budget ended the search; `scope`: what was tried, None where unknown. Where that is not
-      everything, probabilities cover what was tried, and `unknown` includes the causes that were not
+    - `complete` False: the budget ended the search; `scope`: what was tried. Where that is not everything,
+      probabilities cover what was tried, and `unknown` includes the causes that were not
     - `alarms`: what `avtorch estimate` raised on these drives, where that was given; it is drawn and changes nothing
 
     The verdict is the budget's where there is one, else the most probable hypothesis.

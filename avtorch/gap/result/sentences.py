@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from numpy.typing import NDArray
@@ -52,7 +52,7 @@ class Findings:
     next_experiment: Mapping[str, Any] | None = None
     setting: Mapping[str, Any] | None = None
     complete: bool = True
-    scope: Scope | None = None
+    scope: Scope = field(default_factory=Scope)
     notes: tuple[str, ...] = ()
     onset_log: int = 0
     budget: Budget | None = None
@@ -247,7 +247,7 @@ def moved(found: Findings) -> list[str]:
 
 def aliases(found: Findings) -> str:
     """The hypotheses that the log cannot distinguish from the verdict."""
-    tried = found.scope is None or not found.scope.not_scored
+    tried = not found.scope.not_scored
     words = {"none": "no effect at all", "unknown": f"a cause {'outside the table' if tried else 'that was not tried'}"}
     if found.budget is not None and len(found.verdict.names) > 2:
         each = (*found.budget.parts, *found.budget.chance)
@@ -277,12 +277,12 @@ def untried(scope: Scope) -> list[str]:
 
 
 def _all_tried(found: Findings) -> bool:
-    return found.complete and (found.scope is None or found.scope.whole)
+    return found.complete and found.scope.whole
 
 
 def _known(found: Findings) -> str:
     """The set of effects that the sentence excludes."""
-    if found.scope is None or _all_tried(found):
+    if _all_tried(found):
         return "effects known here"
     tried = f"effects tried, {len(found.scope.scored)} of {len(found.scope.scored + found.scope.not_scored)}"
     return f"single {tried}" if found.scope.pairs == "none" else tried
