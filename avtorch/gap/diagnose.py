@@ -155,8 +155,7 @@ def diagnose(
     handed_back = ParameterPosterior(repaired, draws if repaired is weight else None, seed, random)
     if told is not None:
         told("held-out blocks", 0, 1)
-    found = None if named_only else fitted_form(repaired.examined.hypothesis, base, none)
-    free = found if found is not None and found.earns_its_place(named=named) else None
+    free = None if named_only else fitted_form(repaired.examined.hypothesis, base, none, named=named)
     visited = [h for h in inference.search.visited.values() if h.force is None]
     held = held_out_errors(none, repaired.examined.hypothesis, visited, free, named=named)
     free = free if held is None or held.free else None
