@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS, BENCHMARKS = ROOT / "docs", ROOT / "benchmarks"
 OF_DOCS = [*sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("effects/*.md"))]
 ALL = [ROOT / "README.md", ROOT / "CHANGELOG.md", *OF_DOCS, *sorted(BENCHMARKS.rglob("*.md"))]
-# with tests of their own: tests/gap/simulator/test_own_effect_page.py, tests/test_gallery.py, tests/test_tutorial.py
+# with tests of their own: tests/gap/simulator/test_own_effect.py, tests/test_gallery.py, tests/test_tutorial.py
 ELSEWHERE = ("gallery.md", "own-effect.md", "tutorial.md")
 CODE = [p.name for p in OF_DOCS if "```python" in p.read_text(encoding="utf-8") and p.name not in ELSEWHERE]
 QUICK = ("paper.md",)

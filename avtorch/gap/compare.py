@@ -157,7 +157,7 @@ def compare(
 
 @dataclass(frozen=True, eq=False)
 class _LagAndGain:
-    """One set of drives, `rows`: `mean` and `covariance` of ln T_L and ln K_L, estimated from `blocks` blocks."""
+    """One set of drives, `rows`: `mean` and `covariance` of ln T_L and ln K_L, behind a recorder, by `blocks`."""
 
     rows: CountedRows = field(repr=False)
     mean: FloatArray
@@ -169,8 +169,16 @@ class _LagAndGain:
         data = DriveData.of(logs)
         rows = CountedRows.of(logs, data)
         check_length(rows, which)
-        mean, information, scores = _fitted(data, base)
-        scores = scores - scores.mean(1, keepdims=True)
+        alone = data.channel_count == 1
+        h = base_fit(data.below(ONE_CHANNEL_HZ) if alone else data, base, alone=alone)
+        names = h.free
+        J = jacobian(h, names)
+        here = np.array([h[name] for name in _CAR])
+        slopes = np.array([*here, *np.ones(len(names) - 2)])  # of the parameters by the logarithms of the first two
+        W = whitened_jacobian(h, J) * slopes[:, None]
+        information = W @ W.T + np.diag(prior_terms(h, names)[0] * slopes**2)
+        scores = block_scores(h, h.covariance, J, h.residual) * slopes[:, None]  # (parameter, block)
+        scores -= scores.mean(1, keepdims=True)
         count = scores.shape[1]
         between = scores @ scores.T * count / (count - 1)
         inverse = np.linalg.inv(information)
@@ -178,24 +186,11 @@ class _LagAndGain:
         # in coordinates that whiten the posterior: the spread is no smaller than the posterior's in any direction
         sizes, axes = np.linalg.eigh(root.T @ between @ root)
         spread = root @ axes @ np.diag(np.maximum(sizes, 1.0)) @ axes.T @ root.T
-        return cls(rows, mean, spread[:2, :2], count)
+        return cls(rows, np.log(here), spread[:2, :2], count)
 
     def fitted(self, base: GapPlant) -> GapPlant:
         """The simulator with this lag and gain."""
         return base.with_values(dict(zip(_CAR, np.exp(self.mean).tolist(), strict=True)))
-
-
-def _fitted(data: DriveData, base: GapPlant) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """ln T_L and ln K_L (2,) behind a recorder; information (parameter, parameter) and scores (parameter, block)."""
-    alone = data.channel_count == 1
-    h = base_fit(data.below(ONE_CHANNEL_HZ) if alone else data, base, alone=alone)
-    names = h.free
-    J = jacobian(h, names)
-    here = np.array([h[name] for name in _CAR])
-    slopes = np.array([*here, *np.ones(len(names) - 2)])  # of the parameters by the logarithms of the first two
-    W = whitened_jacobian(h, J) * slopes[:, None]
-    information = W @ W.T + np.diag(prior_terms(h, names)[0] * slopes**2)
-    return np.log(here), information, block_scores(h, h.covariance, J, h.residual) * slopes[:, None]
 
 
 def check_length(rows: CountedRows, which: str) -> None:

@@ -155,8 +155,7 @@ def diagnose(
     handed_back = ParameterPosterior(repaired, draws if repaired is weight else None, seed, random)
     if told is not None:
         told("held-out blocks", 0, 1)
-    found = None if named_only else fitted_form(repaired.examined.hypothesis, base, none)
-    free = found if found is not None and found.earns_its_place(named=named) else None
+    free = None if named_only else fitted_form(repaired.examined.hypothesis, base, none, named=named)
     visited = [h for h in inference.search.visited.values() if h.force is None]
     held = held_out_errors(none, repaired.examined.hypothesis, visited, free, named=named)
     free = free if held is None or held.free else None
@@ -206,13 +205,13 @@ def diagnose(
         alias_set=tuple(dict.fromkeys([*said.alias_set, *others])),
         why=f"{said.why} {said_of_unnamed(parts, said.abstained, each[0].epoch_s)}".strip(),
     )
-    attribution = row_attribution(rows, best, none)
+    errors = [rows.errors(h) for h in (none, best, repaired.examined.hypothesis)]
+    attribution = row_attribution(rows, best, none, (errors[0] - errors[1]).mean(-1))
     onset = None
     if names != ("none",):
         onset = first_onset(weight if named else top, names if named else top.label.split("+"))
     since = None if onset is None else onset.stamp_s - each[onset.log].epoch_s
     scope = _scope(inference, shown, data.channels, pairs)
-    errors = [rows.errors(h) for h in (none, best, repaired.examined.hypothesis)]
     after = errors[2] if named else errors[0]
     if free is not None:
         after = rows.errors(free.lagged, free.without([]))

@@ -94,8 +94,11 @@ class RowAttribution:
         return float(np.exp(-np.clip(self.gained.sum() - self.paid, 0.0, 700.0)))
 
 
-def row_attribution(rows: CountedRows, h: Hypothesis, base: Hypothesis) -> RowAttribution:
-    """The attribution of an evaluated hypothesis over the base; both about the same data as `rows`."""
+def row_attribution(rows: CountedRows, h: Hypothesis, base: Hypothesis, moved: FloatArray) -> RowAttribution:
+    """The attribution of an evaluated hypothesis over the base; both about the same data as `rows`.
+
+    `moved` (channel, counted): the change of the rollout.
+    """
     before, after = _squares(h, base.residual), _squares(h, h.residual)
     gained = rows.of_rows(before - after).sum(1)
     total = float(h.log_likelihood - base.log_likelihood)
@@ -105,7 +108,6 @@ def row_attribution(rows: CountedRows, h: Hypothesis, base: Hypothesis) -> RowAt
     does = rows.of_rows(_squares(h, h.predicted - base.predicted)).sum(1)
     sensed = _without_sensor(h)
     felt = np.zeros_like(does) if sensed is None else rows.of_rows(_squares(h, h.predicted - sensed)).sum(1)
-    moved = (rows.errors(base) - rows.errors(h)).mean(-1)
     return RowAttribution(record=rows, gained=gained, paid=float(cost), does=does, felt=felt, moved=moved)
 
 

@@ -76,8 +76,7 @@ class Part:
     plausible: bool = True
 
     def to_dict(self) -> dict[str, Any]:
-        out = of_fields(self)
-        del out["share"]["sd"]
+        out = of_fields(self, intervals=True)
         return {"names": [out.pop("name")]} | out
 
 
@@ -377,11 +376,13 @@ def budget_of(
     most = max(sum(p.share.mean for p in parts), 1.0)  # an effect without a name may cost instead of taking off
     parts = [replace(p, share=p.share.scaled(1 / most)) for p in parts]
     carried = shares.get("free form")
+    three = np.stack([x.squares.sum(1) for x in (held.steps[0], held.floor, held.steps[-1])], 1)
+    levels = np.sqrt(three / held.blocks.sizes.sum())  # (channel, before, floor and left)
     by_chance = (ChancePart(**about(n), share_of_noise=_share_of_noise(posterior, n)) for n in names if n in chance)
     return Budget(
         before=float(np.sqrt(energy[0].mean() / bottom)),
         left=float(np.sqrt(energy[-1].mean() / bottom)),
-        by_channel=dict(zip(held.data.channels, _levels(held), strict=True)),
+        by_channel={name: ChannelError(*x) for name, x in zip(held.data.channels, levels.tolist(), strict=True)},
         parts=tuple(parts),
         unexplained=Unexplained(
             Quantity.of_resampled(1 - sum(p.share.mean for p in parts), rest),
@@ -452,10 +453,9 @@ def least_visible(h: Hypothesis, among: Sequence[str]) -> Mapping[str, tuple[flo
     sizes: dict[str, list[float]] = {}
     for e in tried(h, among):
         found = [_shown(h, projection, response, e.name, start) for start in e.starts]
-        found = [(gain, size) for gain, size in found if gain > 0 and size > 0]
-        if e.name.startswith("~") or not found:
+        gain, size = max(((gain, size) for gain, size in found if gain > 0 and size > 0), default=(0.0, 0.0))
+        if e.name.startswith("~") or not gain:
             continue
-        gain, size = max(found)
         family = family_of(base_name(e.name))
         nats.setdefault(family, []).append(gain)
         sizes.setdefault(family, []).append(size * float(np.sqrt(EFFECT_NATS / gain)))
@@ -463,12 +463,6 @@ def least_visible(h: Hypothesis, among: Sequence[str]) -> Mapping[str, tuple[flo
 
 
 # inside ---------------------------------------------------------------------------------------------------------------
-def _levels(held: HeldOut) -> list[ChannelError]:
-    """Root mean squares before, at the floor and left, a channel."""
-    three = np.stack([x.squares.sum(1) for x in (held.steps[0], held.floor, held.steps[-1])])
-    return [ChannelError(*map(float, x)) for x in np.sqrt(three / held.blocks.sizes.sum()).T]
-
-
 def _shares(energy: FloatArray, floor: FloatArray, seed: int) -> FloatArray:
     """Shares (draw, part and rest) of the gap under resampled blocks; the first draw is of the blocks themselves."""
     levels = resampled(energy, seed).T  # draw, model

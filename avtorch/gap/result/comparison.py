@@ -260,17 +260,13 @@ def _of_effect(h: Hypothesis, change: JointChange) -> dict[str, float]:
     own = {q.name: q for q in effect.parameters}
     out = {}
     for key, value in effect.report(torch.tensor([h["T_L"]], dtype=torch.float64)).items():
-        x, q = torch.as_tensor(value).reshape(-1), own.get(key)
+        x = torch.as_tensor(value).reshape(-1)
         if len(x) != 1 or not math.isfinite(float(x[0])):
             continue
-        if (
-            q is not None
-            and q.neutral is not None
-            and math.isinf(q.neutral)
-            and abs(float(x[0])) > max(map(abs, q.physical))
-        ):
+        size, neutral = float(x[0]), own[key].neutral if key in own else None
+        if neutral is not None and math.isinf(neutral) and abs(size) > max(map(abs, own[key].physical)):
             continue  # a limit out of reach
-        out[key] = -float(x[0]) if change.less and q is not None and q.neutral == 0.0 else float(x[0])
+        out[key] = -size if change.less and neutral == 0.0 else size
     return out
 
 

@@ -210,7 +210,6 @@ def speed_gained(grid: Grid, accel: FloatArray) -> FloatArray:
 class Blocks:
     """Blocks of rows, in order, and the `fold` (block,) that holds each out. Of frames: the block (frame,) of their
     first hop, and the folds' masks `taught` (fold, frame). `by_drives`: folds are whole drives.
-
     """
 
     rows: tuple[slice, ...]

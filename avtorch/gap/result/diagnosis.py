@@ -15,7 +15,6 @@ from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.gap.quantity import Quantity, frame_of, plain, unit_of
 from avtorch.gap.result import sentences
-from avtorch.gap.result.findings import Findings
 from avtorch.gap.result.hypotheses import plausibility
 from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.gap.simulator.plant import GapPlant
@@ -43,7 +42,7 @@ DIAGNOSIS_FILES = (
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Diagnosis(Displayed, Findings):
+class Diagnosis(Displayed, sentences.Findings):
     """What the simulator lacks, according to a log; `str()` states it in a few sentences.
 
     - `candidates`: the hypotheses as `listed_candidates` orders them, whatever the order given
@@ -64,9 +63,8 @@ class Diagnosis(Displayed, Findings):
     - `remaining`: with the default baseline, the hypotheses given that `dead_time` is in the simulator
     - `onset_s`: onset of the effect, on the own clock of log number `onset_log`; `onset_from_start_s`: from its first
       row, the time scale of `gain_change` in `plant`
-    - `complete` False: the budget ended the search; `scope`: what was tried, None where unknown. Where that is not
-      everything, probabilities cover what was tried, and `unknown` includes the causes that were not
-
+    - `complete` False: the budget ended the search; `scope`: what was tried. Where that is not everything,
+      probabilities cover what was tried, and `unknown` includes the causes that were not
     - `alarms`: what `avtorch estimate` raised on these drives, where that was given; it is drawn and changes nothing
 
     The verdict is the budget's where there is one, else the most probable hypothesis.

@@ -441,22 +441,15 @@ class Products:
 class FittedForm:
     """A free form of `sizes` beside a hypothesis; without a table and a resistance it is the gain of free runs.
 
-    On blocks left out, as logarithms of the mean squared error over that of the baseline, whose gain the same blocks
-    teach, each by the worse way of leaving out: `score`, with what the form costs, `named`, of the hypothesis by
-    itself, and `bare`, of the baseline with the evidence's gain.
+    `score`: on blocks left out, the logarithm of the mean squared error over that of the baseline, whose gain the same
+    blocks teach, by the worse way of leaving out, with what the form costs.
     """
 
     hypothesis: Hypothesis
     fit: Fit = field(repr=False)
     sizes: Sizes
     score: float
-    named: float
-    bare: float
     independent: float
-
-    def earns_its_place(self, *, named: bool) -> bool:
-        """Whether it foretells blocks left out better than what is handed back without it: names, or the baseline."""
-        return self.score < (self.named if named else self.bare)
 
     @property
     def words(self) -> str:
@@ -508,11 +501,12 @@ class FittedForm:
         return h
 
 
-def fitted_form(h: Hypothesis, baseline: GapPlant | None, bare: Hypothesis) -> FittedForm | None:
+def fitted_form(h: Hypothesis, baseline: GapPlant | None, bare: Hypothesis, *, named: bool) -> FittedForm | None:
     """The free form beside a hypothesis (its force map, if any, apart) that does best on blocks left out.
 
-    `bare`: what it is scored over. None where no speed was measured, blocks are too few, their speed falls as the
-    command rises, or the baseline has a free form of its own.
+    `bare`: what it is scored over. None where it foretells these blocks no better than what is handed back without it:
+    the hypothesis, if it is `named`, or the baseline with the evidence's gain; and where no speed was measured, blocks
+    are too few, their speed falls as the command rises, or the baseline has a free form of its own.
     """
     given = () if baseline is None else baseline.effects
     if h.data.speed is None or any(isinstance(e, FREE_FORMS) for e in given):
@@ -527,14 +521,13 @@ def fitted_form(h: Hypothesis, baseline: GapPlant | None, bare: Hypothesis) -> F
     independent = max(len(car.rows.speed) * car.rows.dt / INDEPENDENT_S, 3.0)
     base = Car.of(bare, baseline, (float(np.log(bare["T_L"])), 1.0))
     over = squares_of(Fit(base, base.zero, cut=True), Prior(base, Sizes(0.0, 0.0)), left, independent)
-
-    def as_it_is(car: Car) -> float:
-        return left.worse(left.squares([Fit(car, car.zero, cut=True).errors] * len(left.told), runs), over)
-
+    other = car if named else base
+    as_it_is = left.squares([Fit(other, other.zero, cut=True).errors] * len(left.told), runs)
     best = best_form(car, left, over, independent)
-    if h["K_L"] + best.fit.at.gain <= 0:  # the free runs follow no command
+    follows = h["K_L"] + best.fit.at.gain > 0  # else free runs move against the command
+    if not follows or best.score >= left.worse(as_it_is, over):
         return None
-    return FittedForm(h, best.fit, best.sizes, best.score, as_it_is(car), as_it_is(base), independent)
+    return FittedForm(h, best.fit, best.sizes, best.score, independent)
 
 
 def _as_a_plant(h: Hypothesis) -> Hypothesis:

@@ -125,7 +125,7 @@ def _one_step(record: CountedRows, errors: FloatArray, lag: float) -> float:
 def repeatability(record: CountedRows) -> Repeatability | None:
     """The repeatability from windows with repeated commands; None where there are none."""
     rows, settled = round(WINDOW_S / record.dt), round(SETTLED_S / record.dt)
-    found = list(_pairs(record.command, record.stretch, rows))
+    found = _pairs(record.command, record.stretch, rows)
     if not found:
         return None
     floors: dict[str, float] = {}

@@ -264,18 +264,11 @@ def candidates_of(
         parameters: dict[str, Quantity] = {} if label == "none" or p < LEAST_LISTED else own.named()
         moved = own.moved()
         odd = implausible(parameters, moved, [k for k in kinds if k.name in label.split("+")])
-        onset = None if label == "none" else first_onset(weight, label.split("+"))
-        out.append(
-            Candidate(
-                label,
-                p,
-                float(weight.evidence - none),
-                parameters,
-                {} if label == "none" else moved,
-                None if onset is None else onset.stamp_s,
-                odd,
-            )
-        )
+        if label == "none":
+            moved = {}
+        onset = first_onset(weight, label.split("+"))
+        began = None if onset is None else onset.stamp_s
+        out.append(Candidate(label, p, float(weight.evidence - none), parameters, moved, began, odd))
     return out, posteriors
 
 
@@ -340,11 +333,11 @@ def given_dead_time(
 # parts --------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class AnswerPart:
-    """A part of what the simulator lacks: `name` of an effect, None of a free form; its `family`; `form` of a free one.
+    """A part of what the simulator lacks, an entry of `parts` in `diagnosis.json`.
 
+    `name` of an effect, None of a free form; its `family`; `form` of a free one.
     `size_mps2`: root mean square of what it adds to the acceleration or to the rate of the speed, None where that is
     not measured. `where` a free form acts, in time, speed, command, frequency.
-
     """
 
     name: str | None
@@ -353,10 +346,6 @@ class AnswerPart:
     size_mps2: Quantity | None
     probability: float
     where: tuple[Location, ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """An entry of `parts` in `diagnosis.json`."""
-        return of_fields(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -404,9 +393,9 @@ def parts_of(
         if name not in ("none", "unknown")
     ]
     present = min(sum(average.force_maps.values()), 1.0)  # which rounding may exceed
-    weight = _with_map(average, posterior.weight)
-    if weight is not None and present >= LEAST_LISTED:
-        h = weight.examined.hypothesis
+    having = [w for w in average.best.values() if w.examined.hypothesis.force is not None]
+    if having and present >= LEAST_LISTED:
+        h = max(having, key=lambda w: (w is posterior.weight, w.log_weight)).examined.hypothesis
         form = max(average.force_maps, key=lambda name: average.force_maps[name])
         parts.append(AnswerPart(None, "force map", form, map_size(h, seed), present))
     for form, probability in sorted(average.parts.items(), key=lambda kv: -kv[1]):
@@ -446,14 +435,6 @@ def map_size(h: Hypothesis, seed: int = 0) -> Quantity:
     random = np.random.default_rng(seed).standard_normal((_DRAWS, n))
     draws = b + random * np.sqrt(np.maximum(sizes, 0.0)) @ turn.T
     return Quantity.of_draws(np.sqrt(np.einsum("dk,kl,dl->d", draws, h.force.gram, draws)))
-
-
-def _with_map(average: ModelAverage, weight: Weight) -> Weight | None:
-    """The weight, or else the strongest of the average, that has a force map."""
-    having = [w for w in average.best.values() if w.examined.hypothesis.force is not None]
-    if weight.examined.hypothesis.force is not None:
-        return weight
-    return max(having, key=lambda w: w.log_weight, default=None)
 
 
 def _size(posterior: ParameterPosterior, name: str) -> Quantity | None:

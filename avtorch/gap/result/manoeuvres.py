@@ -12,6 +12,7 @@ from avtorch.gap.result.traces import Traces
 
 BEFORE_S, AFTER_S = 1.0, 4.0
 """What is shown before a manoeuvre begins and after it has ended [s]."""
+_MOST = 6
 _JUMP_S = 0.5  # within which a step is commanded
 _LONGEST_S = 6.0  # of a manoeuvre
 _PAUSE_S = 0.3  # within which a change that rests still goes on
@@ -55,8 +56,8 @@ class Manoeuvre:
     responses: Mapping[str, Response] = field(repr=False)
 
 
-def manoeuvres(traces: Traces, *, most: int = 6, named: bool = True) -> tuple[Manoeuvre, ...]:
-    """The manoeuvres in which the simulator errs most, at most `most`, none overlapping another; the worst first.
+def manoeuvres(traces: Traces, *, named: bool = True) -> tuple[Manoeuvre, ...]:
+    """The manoeuvres in which the simulator errs most, six at most, none overlapping another; the worst first.
 
     `named`: the repaired simulator is among their lines. No kind takes more than half of the places while another is
     left. Accelerations are taken from the speed's slope where they were not measured.
@@ -94,7 +95,7 @@ def manoeuvres(traces: Traces, *, most: int = 6, named: bool = True) -> tuple[Ma
             found.append((float(energy[end] - energy[begin]) / whole, kind, first, last, slice(begin, end)))
     found.sort(reverse=True, key=lambda change: change[0])
     out = []
-    for share, kind, first, last, rows in _chosen(found, most):
+    for share, kind, first, last, rows in _chosen(found):
         change = float(traces.command[last] - traces.command[first])
         part = {name: values[rows] for name, values in lines.items()}
         responses = {name: _response(part["command"], values, change, step) for name, values in part.items()}
@@ -107,12 +108,12 @@ _Change = tuple[float, str, int, int, slice]
 """Share of the error, kind, first and last row of the change, and the rows about it."""
 
 
-def _chosen(ranked: Sequence[_Change], most: int) -> list[_Change]:
+def _chosen(ranked: Sequence[_Change]) -> list[_Change]:
     taken: list[_Change] = []
-    for limit in (max(1, most // 2), most):
+    for limit in (_MOST // 2, _MOST):
         for each in ranked:
             apart = all(each[4].stop <= other[4].start or other[4].stop <= each[4].start for other in taken)
-            if apart and len(taken) < most and sum(other[1] == each[1] for other in taken) < limit:
+            if apart and len(taken) < _MOST and sum(other[1] == each[1] for other in taken) < limit:
                 taken.append(each)
     return sorted(taken, reverse=True, key=lambda change: change[0])
 

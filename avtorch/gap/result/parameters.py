@@ -30,6 +30,7 @@ from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io.units import GRAVITY
 
 _DRAWS = 1000
+_BELIEVED = 64  # of these, handed back with a simulator
 _FARTHEST = 12.0  # m/s² or m/s³: no car's limit
 _GRID_STEP = 0.07  # standard deviation of the logarithm of what is read from a grid of sizes
 
@@ -163,16 +164,16 @@ class ParameterPosterior:
             return each.get(self.names[0], {})
         return {f"{name}.{key}": q for name, own in each.items() for key, q in own.items()}
 
-    def belief(self, count: int = 64) -> dict[str, FloatArray]:
+    def belief(self) -> dict[str, FloatArray]:
         """Draws (draw,) of the repaired simulator's parameters, by its own names."""
-        every = max(1, len(self._column("T_L")) // count)
-        out = {name: self._column(name)[::every][:count] for name in ("T_L", "K_L")}
+        every = max(1, len(self._column("T_L")) // _BELIEVED)
+        out = {name: self._column(name)[::every][:_BELIEVED] for name in ("T_L", "K_L")}
         for e in self.effects:
             effect = self._drawn(e)
             for p in effect.parameters:
                 value = getattr(effect, p.name, None)
                 if isinstance(value, torch.Tensor) and value.dim() == 1:
-                    out[f"{effect.name}.{p.name}"] = value.numpy()[::every][:count]
+                    out[f"{effect.name}.{p.name}"] = value.numpy()[::every][:_BELIEVED]
         return out
 
     def plant(self, baseline: GapPlant | None) -> GapPlant:

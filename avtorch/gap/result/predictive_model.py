@@ -25,7 +25,6 @@ from avtorch.gap.result.parameters import ParameterPosterior
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io.units import GRAVITY
 
-_DRAWS = 64
 MOST_MODELS = 5
 """That an experiment is asked to tell apart."""
 _STAND_IN = 3
@@ -94,7 +93,7 @@ class PredictiveModel:
         return cls(
             name=weight.label,
             plant=posterior.plant(baseline),
-            belief=posterior.belief(_DRAWS),
+            belief=posterior.belief(),
             noise=noise,
             grade_rms=grade,
             specific_force=weight.examined.hypothesis.data.accel_kind == "specific-force",

@@ -22,6 +22,7 @@ BLOCK_S = 10.0
 _SLOPE_S = 1.0  # over which a speed error is turned into an acceleration error
 _SEGMENT_S = 20.0  # of the averaged spectra
 _COLOUR_S = 30.0  # up to which signals are correlated with themselves
+_LAGS_S = (-1.0, 5.0)
 _LEAST_BLOCKS = 4  # in a bin that has an interval
 _Z99 = 2.5758293035489004
 _OVERLAPPED = 1.89  # degrees of freedom per segment: Hann windows that overlap by half (Welch, 1967)
@@ -70,9 +71,9 @@ def spectrum(traces: Traces, residual: FloatArray) -> Spectrum | None:
     return Spectrum(frequency[1:], mean, mean * low, mean * high)
 
 
-def correlation(traces: Traces, residual: FloatArray, *, seconds: float = 5.0) -> Correlation:
-    """Of `residual` (row,) with the command a lag earlier, from -1 s (a later command) to `seconds`."""
-    first, last = -round(1.0 / traces.step), round(seconds / traces.step)
+def correlation(traces: Traces, residual: FloatArray) -> Correlation:
+    """Of `residual` (row,) with the command a lag earlier, from -1 s (a later command) to 5 s."""
+    first, last = (round(lag / traces.step) for lag in _LAGS_S)
     parts = traces.stretches
     u, e = traces.command - traces.command.mean(), residual - residual.mean()
     scale = np.sqrt((u**2).sum() * (e**2).sum()) or 1.0

@@ -23,7 +23,6 @@ class ParameterDifference:
     """A parameter `name` (`T_L`, `K_L`, or `effect.parameter`) of the simulator, and of the `car` that was driven.
 
     `differs`: surely, and by more than matters. `own`: it is one of the simulator's own, by its user's name.
-
     """
 
     name: str
@@ -51,7 +50,6 @@ class SimulatorUnderTest:
     `parameters`: the simulator's own that it was allowed to adjust, and those of the surrogate, beside the car's; where
     one of its own differs, the surrogate is that of the simulator with the car's values. `missing`: effects of the
     verdict that it does not have. `rollouts`: how often the simulator was driven through the drives to fit its own.
-
     """
 
     name: str

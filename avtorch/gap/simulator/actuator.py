@@ -120,21 +120,15 @@ class Actuator:
                 means.append(Substep(mean, part.lag, part.length))
             parts = means
         one, zero = torch.ones(1, dtype=accel0.dtype), torch.zeros(1, dtype=accel0.dtype)
-        m, b = (one, zero, zero, one), (zero, zero)
+        from_accel, from_swing, added = (one, zero), (zero, one), (zero, zero)  # over all parts of the step
         for part in parts:
-            n = modes_over(self.tau, part.lag, part.length)
-            b = (
-                n[0] * b[0] + n[1] * b[1] + (1 - n[0]) * part.target,
-                n[2] * b[0] + n[3] * b[1] - n[2] * part.target,
-            )
-            m = (
-                n[0] * m[0] + n[1] * m[2],
-                n[0] * m[1] + n[1] * m[3],
-                n[2] * m[0] + n[3] * m[2],
-                n[2] * m[1] + n[3] * m[3],
-            )
+            modes = modes_over(self.tau, part.lag, part.length)
+            from_accel, from_swing = _moved(modes, from_accel), _moved(modes, from_swing)
+            accel, swing = _moved(modes, added)
+            added = accel + (1 - modes[0]) * part.target, swing - modes[2] * part.target
+        matrix = from_accel[0], from_swing[0], from_accel[1], from_swing[1]
         rest = torch.zeros_like(accel0)
-        a, swing = scan_pair(m, b, (accel0, rest))
+        a, swing = scan_pair(matrix, added, (accel0, rest))
         return ActuatorState(_joined(accel0, a), _joined(rest, swing), target)
 
     def _part(self, state: ActuatorState, part: Substep) -> tuple[ActuatorState, Tensor, Tensor]:
@@ -159,6 +153,11 @@ class Actuator:
         place = 0.5 * g * h * h - T * (speed - state.accel * h)
         place = place - (self.tau * self.tau * (accel - state.accel) - w * h)
         return ActuatorState(accel, swing, slewed), speed, place
+
+
+def _moved(matrix: tuple[Tensor, Tensor, Tensor, Tensor], x: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    m00, m01, m10, m11 = matrix
+    return m00 * x[0] + m01 * x[1], m10 * x[0] + m11 * x[1]
 
 
 def _joined(first: Tensor, later: Tensor) -> Tensor:

@@ -246,26 +246,26 @@ def end_of_step(
 
     Over the step from speed `v` and `position` the actuator, which is at `accel` now, has `gained` speed.
     """
+
+    def at_end(speed: Tensor) -> EffectContext:
+        return context_of(past, speed, position + 0.5 * dt * (v + speed), dt)
+
     bodies, memory = at_place(past.effects, "body"), dict(past.memory)
     force, speed = past.force, v + gained + dt * past.force
     rounds = 0 if not bodies else _ROUNDS if any(e.needs_speed for e in bodies) else 1
     for _ in range(rounds):
-        after, force = _end_context(past, v, speed, position, dt), torch.zeros_like(speed)
+        after, force = at_end(speed), torch.zeros_like(speed)
         for e in bodies:
             y, memory[e.name] = e.advance(accel, drawn_for(past, e, after), past.memory[e.name])
             force = force + y
         speed = v + gained + 0.5 * dt * (past.force + force)
-    after, seen = _end_context(past, v, speed, position, dt), accel + force
+    after, seen = at_end(speed), accel + force
     for e in at_place(past.effects, "sensor"):
         seen, memory[e.name] = e.advance(seen, drawn_for(past, e, after), past.memory[e.name])
     seen_speed = speed.clamp_min(0.0)  # no car rolls back
     for e in at_place(past.effects, "sensor", "speed"):
         seen_speed, memory[e.name] = e.advance(seen_speed, after, past.memory[e.name])
     return replace(past, seen=seen, seen_speed=seen_speed, speed=speed, force=force, memory=memory)
-
-
-def _end_context(past: SimulationState, v: Tensor, speed: Tensor, position: Tensor, dt: float) -> EffectContext:
-    return context_of(past, speed, position + 0.5 * dt * (v + speed), dt)
 
 
 def context_of(past: SimulationState, v: Tensor, x: Tensor, dt: float) -> EffectContext:

@@ -28,9 +28,14 @@ def _shown(effect: Effect, step: float, speed: float) -> Tensor:
     """Measured acceleration (time,) beyond that at rest, of a step of the command a second after the start."""
     time = 1e3 + 0.02 * torch.arange(400, dtype=torch.float64)
     command = torch.where(time > 1e3 + 1.0, step, 0.0)
-    car, at = plant([effect]), torch.full_like(time, speed)
-    moves, rests = (car.response(SimulatorInput(time, u, at)).accel_measured for u in (command, 0 * command))
+    moves, rests = (_accel(effect, time, u, torch.full_like(time, speed)) for u in (command, 0 * command))
     return moves - rests
+
+
+def _accel(effect: Effect | None, time: Tensor, command: Tensor, speed: Tensor | None = None) -> Tensor:
+    """Measured acceleration (..., time) of GLVD with the effect."""
+    car = plant([] if effect is None else [effect])
+    return car.response(SimulatorInput(time, command, speed)).accel_measured
 
 
 def is_linear(effect: Effect) -> bool:
@@ -47,7 +52,7 @@ def shown_at(effect: Effect) -> float:
     """Speed [m/s] of a picture of the effect: that of a few at which it pushes the car most by itself."""
     time = 0.1 * torch.arange(20, dtype=torch.float64)
     speeds = torch.tensor(_SPEEDS_MPS, dtype=torch.float64)[:, None].expand(-1, len(time))
-    return _SPEEDS_MPS[int(_rests(effect, time, speeds)[:, -1].abs().argmax())]
+    return _SPEEDS_MPS[int(_accel(effect, time, 0 * speeds, speeds)[:, -1].abs().argmax())]
 
 
 def _typical(kind: type[Effect]) -> Effect:
@@ -64,14 +69,8 @@ def push_signs(kind: type[Effect]) -> frozenset[int]:
     speeds = torch.tensor(_SPEEDS_MPS, dtype=torch.float64)[:, None].expand(-1, len(time))
     draws, first = torch.Generator().manual_seed(0), kind.parameters[0]
     ends = (_typical(kind).replaced({first.name: x}) for x in (first.low, first.high))
-    force = torch.cat([_rests(effect, time, speeds, draws).ravel() for effect in ends])
+    force = torch.cat([_accel(effect.drawn(draws), time, 0 * speeds, speeds).ravel() for effect in ends])
     return frozenset(int(x) for x in torch.where(force.abs() > _LEAST, force, 0.0).sign().unique() if x)
-
-
-def _rests(effect: Effect, time: Tensor, speeds: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Measured acceleration (speed, time) without a command; a road is drawn by the `generator`."""
-    drive = SimulatorInput(time, torch.zeros_like(speeds), speeds)
-    return plant([effect]).response(drive, generator=generator).accel_measured
 
 
 @lru_cache(maxsize=256)
@@ -80,8 +79,7 @@ def is_gain(kind: type[Effect]) -> bool:
     if kind.needs_speed:
         return False
     time = 0.05 * torch.arange(400, dtype=torch.float64)
-    drive = SimulatorInput(time, 2.0 * torch.sin(time))
-    own, bare = (car.response(drive).accel_measured for car in (plant([_typical(kind)]), plant([])))
+    own, bare = (_accel(effect, time, 2.0 * torch.sin(time)) for effect in (_typical(kind), None))
     factor = (own @ bare) / (bare @ bare)
     return abs(float(factor) - 1) > 1e-6 and torch.allclose(own, factor * bare, rtol=0, atol=1e-9)
 

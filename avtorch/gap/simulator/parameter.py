@@ -158,11 +158,11 @@ class Domain:
         """`given` as a float, an int or a tuple. Raises an `InputError` that begins with `where`."""
         if not self.most:
             return self._number(where, given)
-        count = len(cast("list[Any]", given)) if isinstance(given, list) else None
-        if count is None or not self.least <= count <= self.most:
-            what = _found(given) if count is None else f"a list of {count} values"
+        each = cast("list[Any] | None", given if isinstance(given, list) else None)
+        if each is None or not self.least <= len(each) <= self.most:
+            what = _found(given) if each is None else f"a list of {len(each)} values"
             raise InputError(f"{where}: found {what}, needs a list of {self.least} to {self.most} numbers")
-        values = tuple(self._number(f"{where}[{i}]", x) for i, x in enumerate(cast("list[Any]", given)))
+        values = tuple(self._number(f"{where}[{i}]", x) for i, x in enumerate(each))
         if self.rising and any(b <= a for a, b in pairwise(values)):
             raise InputError(f"{where}: found {_found(given)}, needs numbers that rise")
         return values

@@ -24,18 +24,20 @@ MAP = ForceTable((-2.0, 0.0, 2.0), (5.0, 30.0), ((1.0, 0.6), (0.0, 0.0), (-0.2, 
 DRAG = ResistanceCurve((5.0, 30.0), (-0.1, -0.5))
 
 
-@cache
-def found(mapped: bool, seconds: float = 120.0) -> FittedForm:
-    log = log_of([MAP, DRAG] if mapped else [], seconds=seconds, seed=1)
+def form_of(log: Log, baseline: GapPlant | None = None) -> FittedForm | None:
     base = fit(base_fit(DriveData.of(log)))
-    form = fitted_form(base, plant([]), base)
+    return fitted_form(base, plant([]) if baseline is None else baseline, base, named=False)
+
+
+@cache
+def found() -> FittedForm:
+    form = form_of(log_of([MAP, DRAG], seconds=120.0, seed=1))
     assert form is not None
     return form
 
 
 def test_a_car_with_a_map_is_foretold_better_with_one() -> None:
-    form = found(True)
-    assert form.earns_its_place(named=False)
+    form = found()
     assert form.score < -1.0
     car = form.beside(plant([], T_L=0.3))
     assert GapPlant.from_toml(car.to_toml()).to_toml() == car.to_toml()
@@ -43,12 +45,12 @@ def test_a_car_with_a_map_is_foretold_better_with_one() -> None:
 
 
 def test_a_car_without_one_comes_back_without_it() -> None:
-    form = found(False)
-    assert not form.earns_its_place(named=False) or form.score > -0.5
+    form = form_of(log_of([], seconds=120.0, seed=1))
+    assert form is None or form.score > -0.5
 
 
 def test_what_a_block_tells_does_not_teach_it() -> None:
-    form = found(True)
+    form = found()
     rows = [slice(0, 400)]
     apart, whole = form.without(rows), form.without([])
     assert 0.0 < float(np.abs(apart - whole).max()) < 1.0
@@ -90,7 +92,7 @@ def test_a_free_form_that_loses_in_the_budgets_runs_is_not_handed_back(named: fl
 
 def test_the_gust_beside_a_free_form_is_not_handed_back() -> None:
     """The form takes a part of it; what is left is not known."""
-    back = found(True).beside(plant([Gust(0.3, 5.0), ConstantResistance(0.1)]))
+    back = found().beside(plant([Gust(0.3, 5.0), ConstantResistance(0.1)]))
     assert [e.name for e in back.effects if e.name in ("gust", "constant_resistance")] == ["constant_resistance"]
 
 
@@ -105,11 +107,10 @@ def test_a_gain_of_free_runs_is_handed_back_where_the_evidences_errs(fresh_seed:
     log = Log.from_arrays(
         time=time, accel_cmd=slow + lost, accel=accel + 0.05 * rng.normal(size=len(time)), speed=speed
     )
-    base = fit(base_fit(DriveData.of(log)))
-    form = fitted_form(base, plant([]), base)
+    form = form_of(log)
     assert form is not None
+    base = form.hypothesis
     assert base["K_L"] < 0.5
-    assert form.earns_its_place(named=False)
     back = form.beside(plant([], T_L=base["T_L"], K_L=base["K_L"]))
     # of the commands that it follows alone, as a gain or a map; what it does not follow is noise of the command, and
     # makes a regression's gain a little small
@@ -126,10 +127,8 @@ def test_a_speed_that_falls_as_the_command_rises_has_no_free_form() -> None:
     accel -= 0.15 * lfilter([0.1], [1, -0.9], command)
     speed = 20 + 0.05 * np.cumsum(accel) + 0.01 * rng.normal(size=len(time))
     log = Log.from_arrays(time=time, accel_cmd=command, accel=accel + 0.05 * rng.normal(size=len(time)), speed=speed)
-    base = fit(base_fit(DriveData.of(log)))
-    assert fitted_form(base, plant([]), base) is None
+    assert form_of(log) is None
 
 
 def test_a_simulator_that_has_a_force_map_gets_no_second_one() -> None:
-    base = found(mapped=False).hypothesis
-    assert fitted_form(base, plant([MAP]), base) is None
+    assert form_of(log_of([MAP, DRAG], seconds=60.0), plant([MAP])) is None

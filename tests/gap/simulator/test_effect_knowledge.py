@@ -1,4 +1,4 @@
-"""What is found of effects by simulation, and that what they declare is of their own parameters."""
+"""What is found of effects by simulation, what they declare of themselves, and which ones a caller may ask for."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ from collections.abc import Callable
 
 import pytest
 
-from avtorch.gap import EFFECTS, Effect, ForceTable, Saturation, plant
-from avtorch.gap.simulator.effect import delay_effect, delay_key
+import avtorch
+from avtorch.errors import InputError
+from avtorch.gap import EFFECTS, Effect, ForceTable, Saturation, SensorBias, plant
+from avtorch.gap.simulator.effect import chosen_effects, delay_effect, delay_key
 from avtorch.gap.simulator.effect_response import is_gain, is_linear, is_one_sided, push_signs, shown_at
+from avtorch.io import Log
+from tests.gap.records import log_of
 
 NONLINEAR = {"saturation", "dead_band", "backlash", "rate_limit"}
 BENT = ForceTable((0.0, 2.0), (0.0, 30.0), ((0.0, 0.0), (0.0, -1.0)))
@@ -64,3 +68,27 @@ def test_one_effect_stands_for_a_bare_delay() -> None:
     kind = delay_effect()
     assert [k for k in EFFECTS.values() if k.shift is not None] == [kind]
     assert delay_key() in plant([kind]).parameters()
+
+
+@pytest.mark.parametrize(
+    ("effects", "message"),
+    [
+        ("sensor_bias", "effects: found 'sensor_bias', needs a list of names or classes"),
+        ("", "effects: found '', needs a list of names or classes"),
+        (["sensor_bais"], "effect: found 'sensor_bais', needs an effect's name; perhaps sensor_bias"),
+        ([3], "effects: found '3', needs names or classes of effects"),
+        ([Log], "effects: found .*, needs names or classes of effects"),
+        (["sensor_bias", SensorBias], "effects: found sensor_bias twice, needs each effect once"),
+    ],
+)
+def test_effects_that_are_none(effects: object, message: str) -> None:
+    log = log_of(seconds=20.0)
+    with pytest.raises(InputError, match=message):
+        avtorch.diagnose(log, effects=effects)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=message):
+        avtorch.compare(log, log, effects=effects)  # type: ignore[arg-type]
+
+
+def test_effects_by_name_and_by_class() -> None:
+    assert chosen_effects(["dead_time", SensorBias]) == [EFFECTS["dead_time"], SensorBias]
+    assert chosen_effects(None) == [EFFECTS[name] for name in sorted(EFFECTS)]

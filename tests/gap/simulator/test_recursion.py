@@ -20,29 +20,26 @@ def looped(alpha: torch.Tensor, beta: torch.Tensor, x: torch.Tensor) -> torch.Te
     return torch.stack(rows, -1)
 
 
-@pytest.mark.parametrize("steps", [1, 2, 31, 32, 33, 100, 1025])
+@pytest.mark.parametrize("steps", [1, 2, 100, 1025])
 @pytest.mark.parametrize("constant", [False, True])
-@pytest.mark.parametrize("compiled", [False, True])
-def test_scan_is_the_loop(steps: int, constant: bool, compiled: bool, fresh_seed: int) -> None:
+@pytest.mark.parametrize("inference", [False, True])
+def test_scan_is_the_loop(steps: int, constant: bool, inference: bool, fresh_seed: int) -> None:
     torch.manual_seed(fresh_seed)
     alpha, beta, start = (
         torch.rand(3, 1 if constant else steps, dtype=D),
         torch.randn(3, steps, dtype=D),
         torch.randn(3, dtype=D),
     )
-    with torch.inference_mode(compiled):
+    with torch.inference_mode(inference):
         x = scan(alpha, beta, start)
     torch.testing.assert_close(x, looped(alpha, beta, start), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("compiled", [False, True])
-def test_scan_of_hard_factors(compiled: bool) -> None:
+def test_scan_of_hard_factors() -> None:
     beta = torch.ones(200, dtype=D)
     for value in (0.0, 1.0, -1.0, 1e-300):
         alpha = torch.full((200,), value, dtype=D)
-        with torch.inference_mode(compiled):
-            x = scan(alpha, beta, beta[0])
-        torch.testing.assert_close(x, looped(alpha, beta, beta[0]))
+        torch.testing.assert_close(scan(alpha, beta, beta[0]), looped(alpha, beta, beta[0]))
 
 
 def test_scan_broadcasts() -> None:
@@ -52,14 +49,12 @@ def test_scan_broadcasts() -> None:
 
 @pytest.mark.parametrize("steps", [1, 6, 40])
 @pytest.mark.parametrize("constant", [False, True])
-@pytest.mark.parametrize("compiled", [False, True])
-def test_pair_is_the_loop(steps: int, constant: bool, compiled: bool, fresh_seed: int) -> None:
+def test_pair_is_the_loop(steps: int, constant: bool, fresh_seed: int) -> None:
     torch.manual_seed(fresh_seed)
     m = [0.6 * torch.randn(2, 1 if constant else steps, dtype=D) for _ in range(4)]
     b = [torch.randn(2, steps, dtype=D) for _ in range(2)]
     x = [torch.randn(2, dtype=D) for _ in range(2)]
-    with torch.inference_mode(compiled):
-        got = scan_pair((m[0], m[1], m[2], m[3]), (b[0], b[1]), (x[0], x[1]))
+    got = scan_pair((m[0], m[1], m[2], m[3]), (b[0], b[1]), (x[0], x[1]))
     m = [each.expand(2, steps) for each in m]
     for k in range(steps):
         x = [m[0][:, k] * x[0] + m[1][:, k] * x[1] + b[0][:, k], m[2][:, k] * x[0] + m[3][:, k] * x[1] + b[1][:, k]]
