@@ -15,6 +15,7 @@ from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.gap.quantity import Quantity, frame_of, plain, unit_of
 from avtorch.gap.result import sentences
+from avtorch.gap.result.findings import Findings
 from avtorch.gap.result.hypotheses import plausibility
 from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.gap.simulator.plant import GapPlant
@@ -42,7 +43,7 @@ DIAGNOSIS_FILES = (
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Diagnosis(Displayed, sentences.Findings):
+class Diagnosis(Displayed, Findings):
     """What the simulator lacks, according to a log; `str()` states it in a few sentences.
 
     - `candidates`: the hypotheses as `listed_candidates` orders them, whatever the order given
