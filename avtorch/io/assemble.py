@@ -7,12 +7,13 @@ the clock of the fastest of them, and what arrives beside it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.arrays import FloatArray, IntArray
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.clock import clock_words, gap_limit, median_step, since, since_start
 from avtorch.io.formats.listed import Channel, Recording
@@ -104,18 +105,8 @@ def _thinned(time: FloatArray) -> FloatArray:
 _DEAD_MPS, _DEAD_SHARE = 1.0, 0.1
 
 
-@dataclass(frozen=True)
-class Assembled:
-    """Signals ``(time,)`` in SI units by name, segment numbers from 0, columns not used, and what merging left out."""
-
-    signals: dict[str, FloatArray]
-    segment: IntArray
-    ignored: tuple[str, ...]
-    remarks: tuple[str, ...]
-
-
-def assemble(table: Table, mapping: SignalMap, *, following: bool, arrived: Arrivals | None = None) -> Assembled:
-    """Find, convert, check and merge the signals of a log.
+def assemble(table: Table, mapping: SignalMap, *, following: bool, arrived: Arrivals | None = None) -> dict[str, Any]:
+    """Find, convert, check and merge the signals of a log; returns the fields of a `Log` by name.
 
     ``arrived`` holds signals that are not in the table. Rows where a signal with its own stamps had not arrived, or is
     older than three of its own steps (0.1 s at least), are left out, which makes a gap; ``engaged`` and ``segment`` are
@@ -192,7 +183,9 @@ def assemble(table: Table, mapping: SignalMap, *, following: bool, arrived: Arri
     used = {mapping.column.get(signal, signal) for signal in SIGNALS}
     used |= set(mapping.stamp.values())
     ignored = tuple(printable(name, 200) for name in table.names if name not in used)
-    return Assembled(signals, segment, ignored, tuple(remarks))
+    fields = {signal: signals.get(signal) for signal in SIGNALS}
+    fields["engaged"] = signals.get("engaged", np.ones(len(segment))) == 1
+    return {**fields, "segment": segment, "name": source, "ignored": ignored, "remarks": tuple(remarks)}
 
 
 def _leave_out_dead(signals: dict[str, FloatArray], mapping: SignalMap, remarks: list[str]) -> None:

@@ -170,21 +170,9 @@ class Log(Displayed):
 
     @classmethod
     def _of(cls, table: Table, mapping: SignalMap, *, following: bool, arrived: Arrivals | None = None) -> Log:
-        made = assemble(table, mapping, following=following, arrived=arrived)
-        signals = made.signals
-        time = signals["time"]
-        log = cls(
-            time=time,
-            engaged=signals.get("engaged", np.ones(len(time))) == 1,
-            segment=made.segment,
-            **{name: signals.get(name) for name in SIGNALS if name not in ("time", "engaged", "segment")},
-            name=table.source,
-            ignored=made.ignored,
-            remarks=made.remarks,
-            accel_kind="kinematic",
-        )
+        log = cls(**assemble(table, mapping, following=following, arrived=arrived))
         motion = {name: getattr(log, name) for name in ("accel_cmd", "accel", "speed", "lead_speed")}
-        check_units(table.source, log.elapsed, stretches(log.usable, log.segment), **motion)
+        check_units(log.name, log.elapsed, stretches(log.usable, log.segment), **motion)
         return log
 
     def write(self, path: str | os.PathLike[str]) -> None:

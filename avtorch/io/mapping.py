@@ -56,12 +56,8 @@ def given_mapping(
 ) -> SignalMap:
     """The mapping that arguments give, on top of what a file `stated`. Raises InputError as `read_mapping` does."""
     given = _checked(map=map, unit=unit, stamp=stamp, state=state)
-    return SignalMap(
-        column=_distinct({**stated.column, **given.column}),
-        unit={**stated.unit, **given.unit},
-        stamp={**stated.stamp, **given.stamp},
-        state={**stated.state, **given.state},
-    )
+    columns = _distinct(stated.column | given.column)
+    return SignalMap(columns, stated.unit | given.unit, stated.stamp | given.stamp, stated.state | given.state)
 
 
 def _checked(*, map: Pairs, unit: Pairs, stamp: Pairs, state: Pairs) -> SignalMap:

@@ -53,23 +53,16 @@ def seconds_of(cells: Sequence[str]) -> FloatArray:
         if stamp is None:
             continue
         dated |= stamp["day"] is not None
+        zone = "Z" if stamp["zone"] in (None, "UTC", "GMT") else stamp["zone"]
         try:
-            moment = datetime.fromisoformat(f"{stamp['day'] or '1970-01-01'}T{stamp['clock']}+00:00")
+            moment = datetime.fromisoformat(f"{stamp['day'] or '1970-01-01'}T{stamp['clock']}{zone}")
         except ValueError:  # a time that does not exist
             continue
-        out[row] = moment.timestamp() + float(f"0.{stamp['fraction'] or 0}") - _offset(stamp["zone"])
+        out[row] = moment.timestamp() + float(f"0.{stamp['fraction'] or 0}")
     if not dated:  # a clock of hours begins anew
         known = np.flatnonzero(np.isfinite(out))
         out[known[1:]] += _DAY_S * np.cumsum(np.diff(out[known]) < -_DAY_S / 2)
     return out
-
-
-def _offset(zone: str | None) -> float:
-    """Seconds that a zone's clock is ahead of UTC."""
-    if zone is None or zone[0] not in "+-":
-        return 0.0
-    size = 3600.0 * int(zone[1:3]) + 60.0 * int(zone[-2:])
-    return size if zone[0] == "+" else -size
 
 
 _BINARY = re.compile(rb"[\x00-\x08\x0b\x0e-\x1a\x1c-\x1f]")
@@ -138,11 +131,10 @@ _MARKS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spa
 
 def cells_of(line: str, separator: str) -> list[str]:
     """The cells of one line; of a line whose quotation does not end, what a plain split gives."""
-    line = line.rstrip("\r\n")
+    spaced = separator == " "
+    line = line.strip() if spaced else line.rstrip("\r\n")
     try:
-        if separator == " ":
-            return next(csv.reader([line.strip()], delimiter=" ", skipinitialspace=True, strict=True), [])
-        return next(csv.reader([line], delimiter=separator, strict=True), [])
+        return next(csv.reader([line], delimiter=separator, skipinitialspace=spaced, strict=True), [])
     except csv.Error:
         return line.split(separator)
 
