@@ -113,15 +113,15 @@ class Log(Displayed):
         """
         mapping = read_mapping(path, map=map, unit=unit, stamp=stamp, state=state)
         if is_recording(path):
-            if mapping.column.get("time", "time") != "time":
+            if mapping.column_of("time") != "time":
                 named = quoted(mapping.column["time"])
                 raise InputError(
                     f"{place(path)}: time is mapped to {named}; channels of a recording have clocks of their own"
                 )
-            columns = {signal: mapping.column.get(signal, signal) for signal in SIGNALS if signal != "time"}
+            columns = {signal: mapping.column_of(signal) for signal in SIGNALS if signal != "time"}
             recorded, arrived = merged(open_recording(path, columns.values()), columns)
             return cls._of(recorded, mapping, following=following, arrived=arrived)
-        wanted = {mapping.column.get(signal, signal) for signal in SIGNALS} | set(mapping.stamp.values())
+        wanted = {mapping.column_of(signal) for signal in SIGNALS} | set(mapping.stamp.values())
         table = read_table(path, wanted=wanted)
         return cls._of(table, mapping, following=following)
 

@@ -34,6 +34,10 @@ class SignalMap:
     stamp: dict[str, str] = field(default_factory=dict)
     state: dict[str, tuple[float, ...]] = field(default_factory=dict)
 
+    def column_of(self, signal: str) -> str:
+        """The column of a signal: one of its own name unless the mapping says another."""
+        return self.column.get(signal, signal)
+
 
 def read_mapping(
     path: str | os.PathLike[str], *, map: Pairs = None, unit: Pairs = None, stamp: Pairs = None, state: Pairs = None
