@@ -79,8 +79,13 @@ class _Frames:
     """The frames of a log. `bus` tells for each identifier the bus on which it came first."""
 
     def __init__(self, path: Path, kind: Kind, source: str) -> None:
-        self._path, self._kind, self._source = path, kind, source
+        self._kind, self._source = kind, source
         self.remarks: list[str] = []
+        self._raw = read_regular(path, most=MOST_BYTES, need=_NEED)
+        end = self._raw.rfind(b"\n") + 1
+        if kind is not kinds.BLF and self._raw[end:].strip():  # a number at the end may lack its last digits
+            self.remarks.append("the last line does not end; it is left out")
+            self._raw = self._raw[:end]
         self._most: int | None = None
         self.bus: dict[Identifier, Any] = {}
         others: set[Identifier] = set()
@@ -131,16 +136,10 @@ class _Frames:
 
     def _reader(self) -> tuple[Any, io.IOBase]:
         can = library("can.io", self._source, self._kind)
-        raw = read_regular(self._path, most=MOST_BYTES, need=_NEED)
+        stream = io.BytesIO(self._raw)
         if self._kind is kinds.BLF:
-            stream = io.BytesIO(raw)
             return can.BLFReader(stream), stream
-        end = raw.rfind(b"\n") + 1
-        if raw[end:].strip():  # a number at the end may lack its last digits
-            if self._most is None:
-                self.remarks.append("the last line does not end; it is left out")
-            raw = raw[:end]
-        text = io.TextIOWrapper(io.BytesIO(raw), encoding="utf-8", errors="replace")
+        text = io.TextIOWrapper(stream, encoding="utf-8", errors="replace")
         return (can.ASCReader if self._kind is kinds.ASC else can.CanutilsLogReader)(text), text
 
 
