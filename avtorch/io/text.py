@@ -98,8 +98,8 @@ def decoded(source: str, raw: bytes) -> tuple[str, tuple[str, ...]]:
 
 COMMENT = ("#", "//", "%")
 """What a line of comment begins with."""
-SEPARATORS = (",", ";", "\t", "|", " ")
-"""What may stand between cells; a space, any number of them."""
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
+"""What may stand between cells, and its name; of spaces any number."""
 _LINES, _SAMPLE = 100, 20_000  # lines and characters that are looked at
 _COMMA_NUMBER = re.compile(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*")
 _POINT_NUMBER = re.compile(r"\s*[+-]?\d*\.\d*([eE][+-]?\d+)?\s*")
@@ -119,14 +119,11 @@ class Layout:
     @property
     def words(self) -> str:
         """The layout in words."""
-        words = [f"cells separated by {_MARKS[self.separator]}"]
+        words = [f"cells separated by {SEPARATORS[self.separator]}"]
         words += ["decimal commas"] if self.decimal == "," else []
         words += [f"header in line {self.header}"] if self.header > 1 else []
         words += ["a row of units"] if self.units else []
         return ", ".join(words)
-
-
-_MARKS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 
 
 def cells_of(line: str, separator: str) -> list[str]:
@@ -204,13 +201,13 @@ def _header(head: Sequence[tuple[int, str]], rows: Sequence[tuple[int, list[str]
         # a spreadsheet pads the lines before the header with empty cells
         filled = [sum(bool(cell.strip()) for cell in row) for _, row in names]
         return names[filled.index(max(filled))][0], ""
-    for at, line in reversed([(at, line.strip()) for at, line in head if at < number and line.strip()]):
-        mark = next((mark for mark in COMMENT if line.startswith(mark)), None)
-        if mark is not None and number == first:
-            named = cells_of(line[len(mark) :], separator)
-            if len(named) == len(cells) > 1 and not _has_data(named):
-                return at, mark
-            break
+    comments = [(at, line.strip()) for at, line in head if at < number and is_comment(line)]
+    if comments and number == first:
+        at, line = comments[-1]
+        mark = next(mark for mark in COMMENT if line.startswith(mark))
+        named = cells_of(line[len(mark) :], separator)
+        if len(named) == len(cells) > 1 and not _has_data(named):
+            return at, mark
     return first, ""
 
 
