@@ -128,10 +128,10 @@ class Layout:
 
 def cells_of(line: str, separator: str) -> list[str]:
     """The cells of one line; of a line whose quotation does not end, what a plain split gives."""
-    spaced = separator == " "
-    line = line.strip() if spaced else line.rstrip("\r\n")
+    line, spaced = line.rstrip("\r\n"), separator == " "
+    whole = line.strip() if spaced else line
     try:
-        return next(csv.reader([line], delimiter=separator, skipinitialspace=spaced, strict=True), [])
+        return next(csv.reader([whole], delimiter=separator, skipinitialspace=spaced, strict=True), [])
     except csv.Error:
         return line.split(separator)
 
