@@ -68,7 +68,7 @@ def test_types_of_arrays_are_defined_once() -> None:
 
 FILLED = {
     "gap/simulator/effect.py": "the table of effects, one for all, to which a user adds",
-    "io/answer_set.py": "folders that this process writes",
+    "io/answers.py": "folders that this process writes",
 }
 
 

@@ -22,7 +22,7 @@ from pathlib import Path, PurePath
 from typing import Any, Literal
 
 from avtorch.errors import InputError, listed, printable, quoted
-from avtorch.io.answer_set import is_of_answer
+from avtorch.io.answers import is_of_answer
 from avtorch.io.formats import is_recording
 from avtorch.io.mapping import mapping_beside, mapping_place
 from avtorch.io.opening import opened, place, read_regular

@@ -11,8 +11,7 @@ Example:
     (400, 20.0, 1)
 """
 
-from avtorch.io.answer_set import answer_set, read_answer
-from avtorch.io.answers import atomic, write_json
+from avtorch.io.answers import answer_set, atomic, read_answer, write_json
 from avtorch.io.folder_lock import sole_use
 from avtorch.io.leaders import read_following, read_leader
 from avtorch.io.log import STANDSTILL_MPS, Log, LogSource, as_log, as_logs

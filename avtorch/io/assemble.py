@@ -7,12 +7,13 @@ the clock of the fastest of them, and what arrives beside it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.arrays import FloatArray, IntArray
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.clock import clock_words, gap_limit, median_step, since, since_start
 from avtorch.io.formats.listed import Channel, Recording
@@ -104,18 +105,8 @@ def _thinned(time: FloatArray) -> FloatArray:
 _DEAD_MPS, _DEAD_SHARE = 1.0, 0.1
 
 
-@dataclass(frozen=True)
-class Assembled:
-    """Signals ``(time,)`` in SI units by name, segment numbers from 0, columns not used, and what merging left out."""
-
-    signals: dict[str, FloatArray]
-    segment: IntArray
-    ignored: tuple[str, ...]
-    remarks: tuple[str, ...]
-
-
-def assemble(table: Table, mapping: SignalMap, *, following: bool, arrived: Arrivals | None = None) -> Assembled:
-    """Find, convert, check and merge the signals of a log.
+def assemble(table: Table, mapping: SignalMap, *, following: bool, arrived: Arrivals | None = None) -> dict[str, Any]:
+    """Find, convert, check and merge the signals of a log; returns the fields of a `Log` by name.
 
     ``arrived`` holds signals that are not in the table. Rows where a signal with its own stamps had not arrived, or is
     older than three of its own steps (0.1 s at least), are left out, which makes a gap; ``engaged`` and ``segment`` are
@@ -130,27 +121,24 @@ def assemble(table: Table, mapping: SignalMap, *, following: bool, arrived: Arri
         found = "one row" if table.rows == 1 else "a header but no rows"
         raise InputError(f"{source}: has {found}; a log needs at least two rows")
     signals: dict[str, FloatArray] = {}
-    arrivals: dict[str, tuple[FloatArray, FloatArray]] = {}
+    arrivals: Arrivals = {}
     bad, remarks = BadRows(table.rows), list(table.remarks)
     spare = _not_needed(table, mapping, arrived)
     for signal in SIGNALS:
-        column = mapping.column.get(signal, signal)
         if signal in spare:
-            _spare(table, signal, signals, mapping, remarks)
+            _spare(table, mapping, signal, signals, remarks)
         elif signal in arrived:
-            stamps, values = arrived[signal]
-            rows = np.arange(len(stamps))
-            arrivals[signal] = _arrivals(table, signal, column, "its clock", values, stamps, rows, mapping)
-        elif column in table.names:
+            arrivals[signal] = _arrivals(table, mapping, signal, "its clock", *arrived[signal])
+        elif mapping.column_of(signal) in table.names:
             if signal in mapping.stamp:
-                arrivals[signal] = _stamped(table, signal, column, mapping)
+                arrivals[signal] = _stamped(table, mapping, signal)
             else:
-                signals[signal] = _signal(table, signal, column, mapping, bad)
+                signals[signal] = _signal(table, mapping, signal, bad)
     for signal in mapping.unit:
         if signal not in signals and signal not in arrivals:
             raise InputError(f"{source}: unit {signal}={mapping.unit[signal]}: the log has no column for {signal}")
 
-    clock = mapping.column.get("time", "time")
+    clock = mapping.column_of("time")
     _leave_out_disordered(table, signals, clock, bad)
     signals = {signal: values[bad.kept] for signal, values in signals.items()}
     remarks += bad.remarks()
@@ -189,10 +177,12 @@ def assemble(table: Table, mapping: SignalMap, *, following: bool, arrived: Arri
     if "segment" in signals:
         fresh |= np.diff(signals["segment"]) != 0
     segment = np.concatenate([[0], np.cumsum(fresh)]).astype(np.int64)
-    used = {mapping.column.get(signal, signal) for signal in SIGNALS}
+    used = {mapping.column_of(signal) for signal in SIGNALS}
     used |= set(mapping.stamp.values())
     ignored = tuple(printable(name, 200) for name in table.names if name not in used)
-    return Assembled(signals, segment, ignored, tuple(remarks))
+    fields = {signal: signals.get(signal) for signal in SIGNALS}
+    fields["engaged"] = signals.get("engaged", np.ones(len(segment))) == 1
+    return {**fields, "segment": segment, "name": source, "ignored": ignored, "remarks": tuple(remarks)}
 
 
 def _leave_out_dead(signals: dict[str, FloatArray], mapping: SignalMap, remarks: list[str]) -> None:
@@ -207,7 +197,7 @@ def _leave_out_dead(signals: dict[str, FloatArray], mapping: SignalMap, remarks:
     ):
         value = float(signals.pop("accel")[0])
         remarks.append(
-            f"column {mapping.column.get('accel', 'accel')!r} is {value:g} in every row while speed changes by "
+            f"column {mapping.column_of('accel')!r} is {value:g} in every row while speed changes by "
             f"{change:.3g} m/s: the sensor is dead, and accel left out"
         )
 
@@ -216,10 +206,10 @@ def _with_stated_units(table: Table, mapping: SignalMap) -> SignalMap:
     """The mapping, with the units that the file itself states for columns for which none is given."""
     stated = {}
     for signal in SIGNALS:
-        text = table.units.get(mapping.column.get(signal, signal))
+        text = table.units.get(mapping.column_of(signal))
         if text is not None and (unit := stated_unit(signal, text)) is not None:
             stated[signal] = unit
-    return replace(mapping, unit={**stated, **mapping.unit})
+    return replace(mapping, unit=stated | mapping.unit)
 
 
 def _converted(signal: str, values: FloatArray, mapping: SignalMap) -> FloatArray:
@@ -231,7 +221,7 @@ def _converted(signal: str, values: FloatArray, mapping: SignalMap) -> FloatArra
 
 def _require(table: Table, mapping: SignalMap, following: bool) -> None:
     def there(signal: str) -> bool:
-        return mapping.column.get(signal, signal) in table.names
+        return mapping.column_of(signal) in table.names
 
     for option in (mapping.column, mapping.stamp):
         for signal, column in option.items():
@@ -266,8 +256,9 @@ def _place(table: Table, signal: str, column: str, rows: NDArray | None = None) 
     return lambda row: table.where(row if rows is None else int(rows[row]), column) + suffix
 
 
-def _signal(table: Table, signal: str, column: str, mapping: SignalMap, bad: BadRows) -> FloatArray:
+def _signal(table: Table, mapping: SignalMap, signal: str, bad: BadRows) -> FloatArray:
     """A signal (row,) in SI units, NaN in rows that are left out."""
+    column = mapping.column_of(signal)
     read = table.readings(column, as_time=signal == "time", as_state=signal == "engaged")
     bad.leave_out(read.faults)
     values = _converted(signal, read.values, mapping)
@@ -279,18 +270,18 @@ def _signal(table: Table, signal: str, column: str, mapping: SignalMap, bad: Bad
 
 def _not_needed(table: Table, mapping: SignalMap, arrived: Arrivals) -> set[str]:
     """Commands that are no accelerations, in a log that has one and does not ask for them by its mapping."""
-    command = "accel_cmd" in arrived or mapping.column.get("accel_cmd", "accel_cmd") in table.names
+    command = "accel_cmd" in arrived or mapping.column_of("accel_cmd") in table.names
     others = {*PEDALS, "speed_cmd"} - set(mapping.column) - set(mapping.unit)
     return others if command else set()
 
 
-def _spare(table: Table, signal: str, signals: dict[str, FloatArray], mapping: SignalMap, remarks: list[str]) -> None:
+def _spare(table: Table, mapping: SignalMap, signal: str, signals: dict[str, FloatArray], remarks: list[str]) -> None:
     """Reads a signal that is not needed, or tells why it is left out: it costs no row and refuses no log."""
     if signal not in table.names or table.cells[table.names.index(signal)] is None:
         return
     rows = BadRows(table.rows)
     try:
-        values = _signal(table, signal, signal, mapping, rows)
+        values = _signal(table, mapping, signal, rows)
     except InputError as fault:
         remarks.append(f"{fault}; {signal} is left out")
         return
@@ -309,33 +300,32 @@ def _leave_out_disordered(table: Table, signals: dict[str, FloatArray], clock: s
     bad.leave_out({int(rows[row]): words for row, words in faults.items()})
 
 
-def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tuple[FloatArray, FloatArray]:
+def _stamped(table: Table, mapping: SignalMap, signal: str) -> tuple[FloatArray, FloatArray]:
     """Arrivals of a signal with a time column of its own in the log's table; empty rows are no arrivals."""
-    clock = mapping.stamp[signal]
+    column, clock = mapping.column_of(signal), mapping.stamp[signal]
     values = table.numbers(column, empty_is_nan=True)
     stamps = table.numbers(clock, empty_is_nan=True)
-    own_clock = clock != mapping.column.get("time", "time")
-    half = np.isnan(values) != np.isnan(stamps) if own_clock else np.zeros(len(values), bool)
-    if half.any():
+    half = np.isnan(values) != np.isnan(stamps)
+    if clock != mapping.column_of("time") and half.any():
         row = int(np.argmax(half))
         empty, full = (column, clock) if np.isnan(values[row]) else (clock, column)
         raise InputError(f"{table.where(row, empty)}: is empty where {full!r} is not; both or neither are needed")
-    rows = np.flatnonzero(~np.isnan(values))
-    return _arrivals(table, signal, column, clock, values, stamps, rows, mapping, mapping.unit.get("time"))
+    stamps = to_si("time", mapping.unit.get("time", "s"))(stamps)
+    return _arrivals(table, mapping, signal, clock, stamps, values)
 
 
 def _arrivals(
-    table: Table, signal: str, column: str, clock: str, values: FloatArray, stamps: FloatArray, rows: NDArray,
-    mapping: SignalMap, time_unit: str | None = None,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    table: Table, mapping: SignalMap, signal: str, clock: str, stamps: FloatArray, values: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Stamps and values (message,) in SI units, checked, of those that are there."""
+    column = mapping.column_of(signal)
+    rows = np.flatnonzero(~np.isnan(values))
     if len(rows) == 0:
         raise InputError(f"{table.source}: column {column!r} ({signal}): holds no value at all")
-    values, stamps = values[rows], stamps[rows]
-    values = _converted(signal, values, mapping)
-    stamps = stamps if time_unit is None else to_si("time", time_unit)(stamps)
+    stamps, values = stamps[rows], _converted(signal, values[rows], mapping)
     check_range(signal, values, _place(table, signal, column, rows))
     # a recorder that writes the last arrival into every row repeats stamp and value together; that is one arrival
     again = np.concatenate([[False], (np.diff(stamps) == 0) & (np.diff(values) == 0)])
-    rows, values, stamps = rows[~again], values[~again], stamps[~again]
+    rows, stamps, values = rows[~again], stamps[~again], values[~again]
     check_time(stamps, _place(table, f"stamp of {signal}", clock, rows))
     return stamps, values

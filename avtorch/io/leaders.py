@@ -209,8 +209,8 @@ def _longest(linked: BoolArray) -> slice | None:
     return slice(int(starts[best]), int(stops[best]) + 1)
 
 
-def _events(table: Table) -> dict[int, slice]:
-    """The rows of each NGSIM event by its number."""
+def _event(table: Table, event: int | None) -> tuple[int, slice]:
+    """The number of an NGSIM event and its rows; None: the longest one, of several the first by number."""
     numbers = table.numbers("event")
     if not len(numbers):
         raise InputError(f"{table.source}: found a header but no rows; needs a recording")
@@ -218,20 +218,14 @@ def _events(table: Table) -> dict[int, slice]:
     if len(bad):
         where = table.where(int(bad[0]), "event")
         raise InputError(f"{where}: is {numbers[bad[0]]:g}; a whole number is needed")
-    found: dict[int, slice] = {}
+    events: dict[int, slice] = {}
     edges = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
     for first, last in pairwise(edges):
-        event = int(numbers[first])
-        if event in found:
+        number = int(numbers[first])
+        if number in events:
             where = table.where(first, "event")
-            raise InputError(f"{where}: event {event} goes on after another; keep its rows together")
-        found[event] = slice(first, last)
-    return found
-
-
-def _event(table: Table, event: int | None) -> tuple[int, slice]:
-    """The number of an event and its rows; None: the longest one, of several the first by number."""
-    events = _events(table)
+            raise InputError(f"{where}: event {number} goes on after another; keep its rows together")
+        events[number] = slice(first, last)
     if event is None:
         event = max(sorted(events), key=lambda one: events[one].stop - events[one].start)
     if event not in events:

@@ -113,15 +113,15 @@ class Log(Displayed):
         """
         mapping = read_mapping(path, map=map, unit=unit, stamp=stamp, state=state)
         if is_recording(path):
-            if mapping.column.get("time", "time") != "time":
+            if mapping.column_of("time") != "time":
                 named = quoted(mapping.column["time"])
                 raise InputError(
                     f"{place(path)}: time is mapped to {named}; channels of a recording have clocks of their own"
                 )
-            columns = {signal: mapping.column.get(signal, signal) for signal in SIGNALS if signal != "time"}
+            columns = {signal: mapping.column_of(signal) for signal in SIGNALS if signal != "time"}
             recorded, arrived = merged(open_recording(path, columns.values()), columns)
             return cls._of(recorded, mapping, following=following, arrived=arrived)
-        wanted = {mapping.column.get(signal, signal) for signal in SIGNALS} | set(mapping.stamp.values())
+        wanted = {mapping.column_of(signal) for signal in SIGNALS} | set(mapping.stamp.values())
         table = read_table(path, wanted=wanted)
         return cls._of(table, mapping, following=following)
 
@@ -170,21 +170,9 @@ class Log(Displayed):
 
     @classmethod
     def _of(cls, table: Table, mapping: SignalMap, *, following: bool, arrived: Arrivals | None = None) -> Log:
-        made = assemble(table, mapping, following=following, arrived=arrived)
-        signals = made.signals
-        time = signals["time"]
-        log = cls(
-            time=time,
-            engaged=signals.get("engaged", np.ones(len(time))) == 1,
-            segment=made.segment,
-            **{name: signals.get(name) for name in SIGNALS if name not in ("time", "engaged", "segment")},
-            name=table.source,
-            ignored=made.ignored,
-            remarks=made.remarks,
-            accel_kind="kinematic",
-        )
+        log = cls(**assemble(table, mapping, following=following, arrived=arrived))
         motion = {name: getattr(log, name) for name in ("accel_cmd", "accel", "speed", "lead_speed")}
-        check_units(table.source, log.elapsed, stretches(log.usable, log.segment), **motion)
+        check_units(log.name, log.elapsed, stretches(log.usable, log.segment), **motion)
         return log
 
     def write(self, path: str | os.PathLike[str]) -> None:

@@ -34,6 +34,10 @@ class SignalMap:
     stamp: dict[str, str] = field(default_factory=dict)
     state: dict[str, tuple[float, ...]] = field(default_factory=dict)
 
+    def column_of(self, signal: str) -> str:
+        """The column of a signal: one of its own name unless the mapping says another."""
+        return self.column.get(signal, signal)
+
 
 def read_mapping(
     path: str | os.PathLike[str], *, map: Pairs = None, unit: Pairs = None, stamp: Pairs = None, state: Pairs = None
@@ -56,12 +60,8 @@ def given_mapping(
 ) -> SignalMap:
     """The mapping that arguments give, on top of what a file `stated`. Raises InputError as `read_mapping` does."""
     given = _checked(map=map, unit=unit, stamp=stamp, state=state)
-    return SignalMap(
-        column=_distinct({**stated.column, **given.column}),
-        unit={**stated.unit, **given.unit},
-        stamp={**stated.stamp, **given.stamp},
-        state={**stated.state, **given.state},
-    )
+    columns = _distinct(stated.column | given.column)
+    return SignalMap(columns, stated.unit | given.unit, stated.stamp | given.stamp, stated.state | given.state)
 
 
 def _checked(*, map: Pairs, unit: Pairs, stamp: Pairs, state: Pairs) -> SignalMap:

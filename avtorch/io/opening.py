@@ -50,7 +50,10 @@ def opened(path: str | os.PathLike[str], *, need: str, links: bool = True) -> Bi
     except FileNotFoundError:
         raise InputError(f"{shown}: no such file") from None
     except (OSError, ValueError) as fault:
-        raise InputError(f"{shown}: {_why(path, fault)}; {need} is needed") from None
+        if os.path.isdir(path):  # what Windows says only when it is opened
+            raise InputError(f"{shown}: is a directory; {need} is needed") from None
+        reason = fault.strerror or type(fault).__name__ if isinstance(fault, OSError) else printable(str(fault), 80)
+        raise InputError(f"{shown}: cannot be read ({reason}); {need} is needed") from None
     try:
         mode = os.fstat(handle).st_mode
         if not stat.S_ISREG(mode):
@@ -91,13 +94,6 @@ def _read(stream: BinaryIO, most: int) -> bytes:
         pieces.append(piece)
         left -= len(piece)
     return b"".join(pieces)
-
-
-def _why(path: str | os.PathLike[str], fault: Exception) -> str:
-    if os.path.isdir(path):  # what Windows says only when it is opened
-        return "is a directory"
-    reason = fault.strerror or type(fault).__name__ if isinstance(fault, OSError) else printable(str(fault), 80)
-    return f"cannot be read ({reason})"
 
 
 MOST_TOML = 1_000_000

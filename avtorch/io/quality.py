@@ -14,7 +14,7 @@ from avtorch.io.clock import clock_words, median_step, stretches
 from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import Log
 from avtorch.io.mapping import PEDALS
-from avtorch.io.validity import DELAYS_S, command_scale, integral, scale_between
+from avtorch.io.validity import DELAYS_S, Scale, command_scale, integral, scale_between
 
 LEAST_S = 2.0
 """The shortest stretch [s] of which anything is estimated: the lag and dead time of a car, and as long again."""
@@ -93,7 +93,10 @@ def check(log: Log) -> Quality:
     present = {name: getattr(log, name) for name in SIGNALS if getattr(log, name) is not None}
     constant = tuple(name for name, values in present.items() if np.ptp(values) == 0)
     missing = tuple(name for name in ("accel_cmd", "accel", "speed") if name not in present)
-    doubtful = tuple(_doubtful_units(log))
+    parts, motion = stretches(log.usable, log.segment), None
+    if log.speed is not None and log.accel is not None:
+        motion = scale_between(log.elapsed, parts, log.speed, log.accel)
+    doubtful = tuple(_doubtful_units(log, parts, motion))
     driver, still = int((~log.engaged).sum()), int((~log.moving).sum())
     returns = int((np.diff(log.engaged.astype(int)) == 1).sum())
     settling = int((log.engaged & ~log.settled).sum())
@@ -132,7 +135,7 @@ def check(log: Log) -> Quality:
     notes.extend(_on_missing(missing, log))
     notes.extend(_repeats(present, log))
     notes.extend(doubtful)
-    notes.extend(_disagreements(log))
+    notes.extend(_disagreements(log, motion))
     if log.ignored:
         notes.append(f"columns ignored: {listed(log.ignored)}")
     notes.extend(log.remarks)
@@ -173,22 +176,20 @@ def _repeats(present: dict[str, NDArray], log: Log) -> list[str]:
     return notes
 
 
-def _doubtful_units(log: Log) -> list[str]:
+def _doubtful_units(log: Log, parts: list[slice], motion: Scale | None) -> list[str]:
+    """`motion`: how speed changes by what accel says over `parts`."""
     notes = []
-    parts = stretches(log.usable, log.segment)
     if log.speed is not None and log.moving.any():
         top, middle = float(log.speed.max()), float(np.median(log.speed[log.moving]))
         if top > 60 or middle > 45:
             notes.append(f"speed reaches {top:.3g} m/s (median {middle:.3g}): could it be km/h? `--unit speed=km/h`")
-    if log.speed is not None and log.accel is not None:
-        found = scale_between(log.elapsed, parts, log.speed, log.accel)
-        times = None if found is None else found.factor
-        if times is not None and found is not None and found.correlation > 0.9 and abs(math.log(times)) > _CALIBRATED:
-            notes.append(
-                f"speed changes {times:.3g} times as much as accel implies: a unit, the accelerometer's scale or the "
-                "speed's, such as a wheel's radius, is wrong. A known distance tells which; until then the car's gain "
-                "is open by as much"
-            )
+    times = None if motion is None or motion.correlation <= 0.9 else motion.factor
+    if times is not None and abs(math.log(times)) > _CALIBRATED:
+        notes.append(
+            f"speed changes {times:.3g} times as much as accel implies: a unit, the accelerometer's scale or the "
+            "speed's, such as a wheel's radius, is wrong. A known distance tells which; until then the car's gain "
+            "is open by as much"
+        )
     if log.accel_cmd is not None:
         found = command_scale(log.elapsed, parts, log.speed, log.accel, log.accel_cmd)
         if found is not None and found.correlation > 0.9 and not 0.2 <= found.slope <= 1.5:
@@ -244,13 +245,12 @@ def require_usable(log: Log) -> None:
         )
 
 
-def _disagreements(log: Log) -> list[str]:
-    if log.speed is None or log.accel is None:
+def _disagreements(log: Log, motion: Scale | None) -> list[str]:
+    if motion is None or log.speed is None:
         return []
-    found = scale_between(log.elapsed, stretches(log.usable, log.segment), log.speed, log.accel)
     # 0.5 m/s in a second, or a twentieth of the top speed of what is slower, is well above noise and grade
     plain = min(0.5, 0.05 * float(np.abs(log.speed).max()))
-    if found is None or found.change < plain or found.correlation >= 0.5:
+    if motion.change < plain or motion.correlation >= 0.5:
         return []
-    r = f"{found.correlation:.2f}"
+    r = f"{motion.correlation:.2f}"
     return [f"speed's derivative and accel disagree (correlation {r}): one of them is not this car's motion"]

@@ -19,17 +19,15 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats.apart import Wanted, parquet_apart
 from avtorch.io.formats.kinds import reason
-from avtorch.io.formats.parquet import Cells, readable
-from avtorch.io.formats.parquet import cells_of as arrow_cells
-from avtorch.io.formats.parquet import is_time as is_time_type
 from avtorch.io.opening import MOST_BYTES, MOST_CELLS, MOST_COLUMNS, beginning, place, read_regular
 from avtorch.io.text import decoded, is_time, is_value, layout_of, rows_of, seconds_of, unzipped
 from avtorch.numeral import numeral
 
+Cells = Sequence[Any] | NDArray
 _NEED = "a CSV or Parquet file"
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Table:
     """Named columns of one file, cells not yet parsed as numbers; None for a column that was not requested.
 
@@ -51,12 +49,12 @@ class Table:
     form: str = "a table"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "source", place(self.source))
+        self.source = place(self.source)
         cells = dict(zip(self.names, self.cells, strict=True))
         for name, halves in whole_stamps(self.names).items():
             if name not in cells:
-                object.__setattr__(self, "names", (*self.names, name))
-                object.__setattr__(self, "cells", (*self.cells, _whole(*(cells[half] for half in halves))))
+                self.names = (*self.names, name)
+                self.cells = (*self.cells, _whole(*(cells[half] for half in halves)))
 
     @property
     def rows(self) -> int:
@@ -202,11 +200,11 @@ def read_table(path: str | os.PathLike[str], *, wanted: Wanted = None) -> Table:
 
 
 def _parquet(file: Path, wanted: Wanted) -> Table:
+    from avtorch.io.formats.parquet import cells_of
+
     names, columns = parquet_apart(file, wanted)
-    read = {
-        name: arrow_cells(columns.column(name), f"{place(file)}: column {quoted(name)}")
-        for name in columns.column_names
-    }
+    where = f"{place(file)}: column"
+    read = {name: cells_of(columns.column(name), f"{where} {quoted(name)}") for name in columns.column_names}
     return Table(place(file), names, tuple(read.get(name) for name in names), form="Parquet")
 
 
@@ -308,13 +306,15 @@ def frame_table(frame: DataFrame, source: str = "DataFrame") -> Table:
     """
     import pyarrow as pa
 
+    from avtorch.io.formats import parquet
+
     try:
         table: Any = pa.table(frame)
     except (pa.ArrowException, TypeError, ValueError, RuntimeError, NotImplementedError) as fault:
         raise InputError(f"{source}: no columns of numbers can be read from it ({reason(fault)})") from None
     names = [str(name) for name in table.column_names]
-    if _INDEX in names and "time" not in names and is_time_type(table.column(names.index(_INDEX)).type):
+    if _INDEX in names and "time" not in names and parquet.is_time(table.column(names.index(_INDEX)).type):
         names[names.index(_INDEX)] = "time"
-    kept = [i for i in range(len(names)) if readable(table.column(i).type)]
-    cells = tuple(arrow_cells(table.column(i), f"{source}: column {quoted(names[i])}") for i in kept)
+    kept = [i for i in range(len(names)) if parquet.readable(table.column(i).type)]
+    cells = tuple(parquet.cells_of(table.column(i), f"{source}: column {quoted(names[i])}") for i in kept)
     return Table(source, tuple(names[i] for i in kept), cells, form=f"a {type(frame).__name__}")

@@ -53,23 +53,16 @@ def seconds_of(cells: Sequence[str]) -> FloatArray:
         if stamp is None:
             continue
         dated |= stamp["day"] is not None
+        zone = "Z" if stamp["zone"] in (None, "UTC", "GMT") else stamp["zone"]
         try:
-            moment = datetime.fromisoformat(f"{stamp['day'] or '1970-01-01'}T{stamp['clock']}+00:00")
+            moment = datetime.fromisoformat(f"{stamp['day'] or '1970-01-01'}T{stamp['clock']}{zone}")
         except ValueError:  # a time that does not exist
             continue
-        out[row] = moment.timestamp() + float(f"0.{stamp['fraction'] or 0}") - _offset(stamp["zone"])
+        out[row] = moment.timestamp() + float(f"0.{stamp['fraction'] or 0}")
     if not dated:  # a clock of hours begins anew
         known = np.flatnonzero(np.isfinite(out))
         out[known[1:]] += _DAY_S * np.cumsum(np.diff(out[known]) < -_DAY_S / 2)
     return out
-
-
-def _offset(zone: str | None) -> float:
-    """Seconds that a zone's clock is ahead of UTC."""
-    if zone is None or zone[0] not in "+-":
-        return 0.0
-    size = 3600.0 * int(zone[1:3]) + 60.0 * int(zone[-2:])
-    return size if zone[0] == "+" else -size
 
 
 _BINARY = re.compile(rb"[\x00-\x08\x0b\x0e-\x1a\x1c-\x1f]")
@@ -105,8 +98,8 @@ def decoded(source: str, raw: bytes) -> tuple[str, tuple[str, ...]]:
 
 COMMENT = ("#", "//", "%")
 """What a line of comment begins with."""
-SEPARATORS = (",", ";", "\t", "|", " ")
-"""What may stand between cells; a space, any number of them."""
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
+"""What may stand between cells, and its name; of spaces any number."""
 _LINES, _SAMPLE = 100, 20_000  # lines and characters that are looked at
 _COMMA_NUMBER = re.compile(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*")
 _POINT_NUMBER = re.compile(r"\s*[+-]?\d*\.\d*([eE][+-]?\d+)?\s*")
@@ -126,23 +119,19 @@ class Layout:
     @property
     def words(self) -> str:
         """The layout in words."""
-        words = [f"cells separated by {_MARKS[self.separator]}"]
+        words = [f"cells separated by {SEPARATORS[self.separator]}"]
         words += ["decimal commas"] if self.decimal == "," else []
         words += [f"header in line {self.header}"] if self.header > 1 else []
         words += ["a row of units"] if self.units else []
         return ", ".join(words)
 
 
-_MARKS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
-
-
 def cells_of(line: str, separator: str) -> list[str]:
     """The cells of one line; of a line whose quotation does not end, what a plain split gives."""
-    line = line.rstrip("\r\n")
+    line, spaced = line.rstrip("\r\n"), separator == " "
+    whole = line.strip() if spaced else line
     try:
-        if separator == " ":
-            return next(csv.reader([line.strip()], delimiter=" ", skipinitialspace=True, strict=True), [])
-        return next(csv.reader([line], delimiter=separator, strict=True), [])
+        return next(csv.reader([whole], delimiter=separator, skipinitialspace=spaced, strict=True), [])
     except csv.Error:
         return line.split(separator)
 
@@ -212,13 +201,13 @@ def _header(head: Sequence[tuple[int, str]], rows: Sequence[tuple[int, list[str]
         # a spreadsheet pads the lines before the header with empty cells
         filled = [sum(bool(cell.strip()) for cell in row) for _, row in names]
         return names[filled.index(max(filled))][0], ""
-    for at, line in reversed([(at, line.strip()) for at, line in head if at < number and line.strip()]):
-        mark = next((mark for mark in COMMENT if line.startswith(mark)), None)
-        if mark is not None and number == first:
-            named = cells_of(line[len(mark) :], separator)
-            if len(named) == len(cells) > 1 and not _has_data(named):
-                return at, mark
-            break
+    comments = [(at, line.strip()) for at, line in head if at < number and is_comment(line)]
+    if comments and number == first:
+        at, line = comments[-1]
+        mark = next(mark for mark in COMMENT if line.startswith(mark))
+        named = cells_of(line[len(mark) :], separator)
+        if len(named) == len(cells) > 1 and not _has_data(named):
+            return at, mark
     return first, ""
 
 

@@ -49,7 +49,6 @@ _UNITS: dict[str, dict[str, float]] = {
     "current": _CURRENT,
     "speed_cmd": _SPEED,
 }
-SIGNALS_WITH_UNIT = tuple(_UNITS)
 SI = {
     **{"time": "s", "accel_cmd": "m/s²", "accel": "m/s²", "speed": "m/s", "jerk": "m/s³", "spacing": "m"},
     **{"lead_speed": "m/s", "lead_accel": "m/s²", "grade": "-", "throttle": "-", "brake": "-", "torque": "Nm"},
@@ -155,10 +154,8 @@ def _plain(text: str) -> str:
 def stated_unit(signal: str, text: str) -> str | None:
     """The unit that a file states for a signal, where it is one that the signal can have; None otherwise."""
     unit = unit_named(text)
-    if unit is None or signal not in SIGNALS_WITH_UNIT:
-        return None
     try:
-        to_si(signal, unit)
+        to_si(signal, unit or "")
     except InputError:
         return None
     return unit

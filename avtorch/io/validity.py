@@ -10,7 +10,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,11 +66,7 @@ def scale_between(
     correlation counts. None where there are fewer than MIN_SPANS separate spans or one of the two signals does not
     move: the scale is then unknown.
     """
-    totals = []
-    for part in parts:
-        t, y = time[part], rate[part]
-        if len(t) > 2:
-            totals.append((t, level[part], integral(t, y)))
+    totals = [(time[x], level[x], integral(time[x], rate[x])) for x in parts if len(time[x]) > 2]
     found = (_compare(totals, span, delay) for span in SPANS_S for delay in delays)
     return max((x for x in found if x is not None), key=_rank, default=None)
 
@@ -80,26 +76,19 @@ def integral(time: NDArray, rate: NDArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.clip(np.diff(time), 0.0, 1.0))])
 
 
-def may_be_late(correlation: Any, *, known: Any) -> Any:
-    """Whether a response that looks inverted may be a late one, by its best `correlation` at LATER_S, where `known`.
+def late_response(time: NDArray, parts: Sequence[slice], level: NDArray, rate: NDArray) -> tuple[Scale | None, bool]:
+    """For a response that looks inverted: the best one at LATER_S, None where unknown, and whether it may be the true
+    one. Arguments as of `scale_between`.
 
     For a command that returns with the other sign after half a period, a late response cannot be distinguished from an
     inverted one: an inverted response counts only where one of the right sign, with up to 2.5 s of delay and lag, is
-    known to correlate far less. Numbers, or arrays or tensors elementwise; bool.
-    """
-    return (known == 0) | (correlation >= _MAY_BE)
-
-
-def late_response(time: NDArray, parts: Sequence[slice], level: NDArray, rate: NDArray) -> tuple[Scale | None, bool]:
-    """For a response that looks inverted: the best one at LATER_S, None where unknown, and whether it may be the true
-    one (`may_be_late`). Arguments as of `scale_between`.
-
-    Short stretches know the smaller delays only; as the largest is unknown then, it may be the car's.
+    known to correlate far less. Short stretches know the smaller delays only; as the largest is unknown then, it may be
+    the car's.
     """
     later = scale_between(time, parts, level, rate, delays=LATER_S)
     if later is None or scale_between(time, parts, level, rate, delays=LATER_S[-1:]) is None:
         return None, True
-    return later, bool(may_be_late(later.correlation, known=True))
+    return later, later.correlation >= _MAY_BE
 
 
 def _compare(totals: list[tuple[NDArray, NDArray, NDArray]], span: float, delay: float) -> Scale | None:
@@ -348,11 +337,10 @@ def command_scale(
 
     An inverted response counts only where it cannot be a late one (`late_response`).
     """
-    if speed is None:
+    level = speed
+    if level is None:
         assert accel is not None
         level = integral(time, accel)
-    else:
-        level = speed
     found = scale_between(time, parts, level, u, delays=DELAYS_S)
     if found is not None and found.slope < 0 and found.correlation <= -_SURE:
         later, possible = late_response(time, parts, level, u)
@@ -378,14 +366,14 @@ def check_units(
         found = scale_between(time, parts, speed, accel)
         options = {f"speed={unit}": factor for unit, factor in SPEED_FACTORS.items()}
         options |= {f"accel={unit}": factor for unit, factor in ACCEL_FACTORS.items()}
-        _refuse_scale(source, "speed", "accel", found, SAME_MOTION, options, "accel=-1")
+        _refuse_scale(source, "speed", "accel", found, SAME_MOTION, options)
     if accel_cmd is not None:
         found = command_scale(time, parts, speed, accel, accel_cmd)
         options = {"accel_cmd=g": GRAVITY, "accel_cmd=cm/s2": 0.01}
         if speed is not None:
             options["speed=km/h"] = 3.6
         answer = "speed" if speed is not None else "accel"
-        _refuse_scale(source, answer, "accel_cmd", found, _COMMAND, options, "accel_cmd=-1")
+        _refuse_scale(source, answer, "accel_cmd", found, _COMMAND, options)
     if speed is not None and lead_speed is not None:
         ratio = float(np.abs(lead_speed).sum() / max(np.abs(speed).sum(), 1e-9))
         for name, expected in (("lead_speed", 3.6), ("speed", 1 / 3.6)):
@@ -397,25 +385,18 @@ def check_units(
 
 
 def _refuse_scale(
-    source: str,
-    level: str,
-    rate: str,
-    found: Scale | None,
-    limits: tuple[float, float],
-    options: dict[str, float],
-    sign: str,
+    source: str, level: str, rate: str, found: Scale | None, limits: tuple[float, float], options: dict[str, float]
 ) -> None:
     if found is None or abs(found.correlation) < _SURE or limits[0] <= found.slope <= limits[1]:
         return
     place = f"{source}: columns {level!r} and {rate!r}"
-    moves = "speed changes" if level == "speed" else "accel changes"
     if found.slope < 0:
         raise InputError(
-            f"{place}: {moves} {found.slope:.3g} times as much as {rate} implies, so one has the wrong sign; "
-            f"`--unit {sign}` reverses it"
+            f"{place}: {level} changes {found.slope:.3g} times as much as {rate} implies, so one has the wrong sign; "
+            f"`--unit {rate}=-1` reverses it"
         )
     near = min(options, key=lambda name: abs(math.log(found.slope / options[name])))
     raise InputError(
-        f"{place}: {moves} {found.slope:.3g} times as much as {rate} implies, so their units differ; "
+        f"{place}: {level} changes {found.slope:.3g} times as much as {rate} implies, so their units differ; "
         f"`--unit {near}` is the nearest"
     )

@@ -10,7 +10,7 @@ not move like, that is a question.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
@@ -20,9 +20,9 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.io.assemble import held, merged
 from avtorch.io.formats.listed import Recording
-from avtorch.io.formats.presets import PRESETS, Preset, Source
 from avtorch.io.tables import Table, whole_stamps
 from avtorch.io.validity import DELAYS_S, MIN_SPANS, MOST_BAD, SPANS_S, codes, integral
+from avtorch.logcheck.layouts import layout_of
 from avtorch.logcheck.recorder import lateness, slope_of
 from avtorch.logcheck.vocabulary import NAMED_SIGNALS, Header, bare_unit, header_of, likeness, means_otherwise
 
@@ -55,7 +55,7 @@ class Column:
 def columns_of(table: Table) -> list[Column]:
     """The columns of a table that hold numbers or times, but for a twentieth of their cells."""
     found = []
-    preset, known = layout_of(table.names)
+    words, known = layout_of(table.names)
     stamps = whole_stamps(table.names)
     for name in dict.fromkeys(table.names):
         if table.names.count(name) > 1:
@@ -69,7 +69,7 @@ def columns_of(table: Table) -> list[Column]:
         read = table.readings(name, empty_is_nan=True, as_time="time" in alike, as_state=True)
         if len(read.values) and len(read.faults) <= MOST_BAD * len(read.values) and np.isfinite(read.values).any():
             when = next((source.when for source in layout.values()), ())
-            found.append(Column(header, read.values, alike, when, preset.words if preset and layout else None))
+            found.append(Column(header, read.values, alike, when, words if layout else None))
     return found
 
 
@@ -101,16 +101,6 @@ def table_of(recording: Recording) -> Table:
         cells[columns[key]] = held(clock, stamps, values)[0]
     units = {name: unit for name, unit in recording.units.items() if name in cells}
     return replace(table, names=tuple(cells), cells=tuple(cells.values()), units=units)
-
-
-def layout_of(names: Iterable[str]) -> tuple[Preset | None, dict[str, tuple[str, Source]]]:
-    """The known layout of a log with columns `names`: one that has a command and a response; nothing otherwise."""
-    there = tuple(names)
-    for preset in PRESETS:
-        found = preset.find(there)
-        if "accel_cmd" in found and ("speed" in found or "accel" in found):
-            return preset, {signal: one for signal, one in found.items() if signal in NAMED_SIGNALS}
-    return None, {}
 
 
 def ranked(columns: list[Column], signal: str) -> list[Column]:
@@ -185,9 +175,9 @@ def assign(clock: FloatArray, parts: list[slice], columns: list[Column], given: 
         if column is None or (question is not None and column.name != signal):
             continue
         if signal == "accel_cmd" and not column.likeness and _one_sided(filled(column)):
-            strength = motion.strength(signal, column, best)
             doubts.append(
-                f"the car's motion follows {column.name} (correlation {strength:.2f}), which is never about zero as an "
+                f"the car's motion follows {column.name} (correlation "
+                f"{motion.strongest(signal, column, best)[0]:.2f}), which is never about zero as an "
                 "acceleration is; name it with --map throttle=COLUMN, torque=COLUMN or what it is"
             )
             continue
@@ -271,9 +261,12 @@ class _Motion:
                 r, name = max(found, key=lambda one: abs(one[0]))
                 yield "response", (name, "accel_cmd"), r
 
-    def strength(self, signal: str, column: Column, of: Mapping[str, Column | None]) -> float:
-        """The strongest correlation of a signal with those of an assignment, 0 where there is none."""
-        return max((r for _, names, r in self.pairs({**of, signal: column}) if signal in names), key=abs, default=0.0)
+    def strongest(self, signal: str, column: Column, of: Mapping[str, Column | None]) -> tuple[float, str | None]:
+        """The strongest correlation of a signal with those of an assignment, and with which; 0 and None where the data
+        do not tell."""
+        found = [(r, names) for _, names, r in self.pairs({**of, signal: column}) if signal in names]
+        r, names = max(found, key=lambda one: abs(one[0]), default=(0.0, ()))
+        return r, next((name for name in names if name != signal), None)
 
 
 def _table(
@@ -394,7 +387,7 @@ def _question(signal: str, choices: list[tuple[float, dict[str, Column | None]]]
             break
         if other is None or other is column or motion.same(signal, column, other):
             continue
-        if signal not in other.likeness and abs(motion.strength(signal, other, of)) < motion.by_chance:
+        if signal not in other.likeness and abs(motion.strongest(signal, other, of)[0]) < motion.by_chance:
             continue
         return (
             f"which column is {signal}? {column.name} by {said} ({_with(signal, column, best, motion)}), or "
@@ -405,11 +398,8 @@ def _question(signal: str, choices: list[tuple[float, dict[str, Column | None]]]
 
 def _with(signal: str, column: Column, of: Mapping[str, Column | None], motion: _Motion) -> str:
     """How a column goes with the other signals, in words."""
-    found = [(r, names) for _, names, r in motion.pairs({**of, signal: column}) if signal in names]
-    if not found:
-        return "nothing else in the log tells"
-    r, names = max(found, key=lambda one: abs(one[0]))
-    return f"correlation {r:.2f} with {next(name for name in names if name != signal)}"
+    r, other = motion.strongest(signal, column, of)
+    return f"correlation {r:.2f} with {other}" if other else "nothing else in the log tells"
 
 
 def _reasons(signal: str, column: Column, best: Mapping[str, Column | None], motion: _Motion, given: bool) -> list[str]:
@@ -421,7 +411,7 @@ def _reasons(signal: str, column: Column, best: Mapping[str, Column | None], mot
             "accel": "its integral is the change of speed",
             "accel_cmd": "the car's motion follows it",
         }[signal]
-        return [f"no name tells; {words} (correlation {abs(motion.strength(signal, column, best)):.2f})"]
+        return [f"no name tells; {words} (correlation {abs(motion.strongest(signal, column, best)[0]):.2f})"]
     return [column.by_what]
 
 

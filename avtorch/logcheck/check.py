@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -140,21 +141,12 @@ def _read(
             reader = Log.from_dataframe if path is None else Log.read
             read = reader(given, **proposal.options, following=leader)  # pyright: ignore[reportArgumentType]
     except InputError as fault:
-        unknown = proposal is not None and "accel_cmd" not in proposal.signals
-        platoon = _platoon(path) if unknown and path is not None else None
-        if platoon is not None:
-            return replace(_seen(source, form, None, platoon), follows=True)
+        if path is not None and proposal is not None and "accel_cmd" not in proposal.signals:
+            with suppress(InputError):  # a recording of cars that follow: the first of them
+                return replace(_seen(source, form, None, read_following(path)), follows=True)
         clock = None if proposal is None or proposal.signals else f"{source}: {proposal.doubts[0]}"
         return LogCheck(source, form, proposal, None, None, clock or str(fault), (), ())
     return _seen(source, form, proposal, read)
-
-
-def _platoon(path: str | os.PathLike[str]) -> Log | None:
-    """The first follower of a recording of cars without commands, where it has a known form."""
-    try:
-        return read_following(path)
-    except InputError:
-        return None
 
 
 def _seen(source: str, form: str, proposal: Proposal | None, log: Log) -> LogCheck:

@@ -142,7 +142,8 @@ def late_channel(log: Log) -> LateChannel | None:
     def gain(smooth: _Tried, delay: _Tried) -> float:
         """Of the best filter over the best delay, in standard errors; over none, where a longer delay were better."""
         over = delay.on_time() if delay.at_an_end() else delay
-        return _ratio([smooth.best(i)[1] - over.best(i)[1] for i in every])
+        gains = [smooth.best(i)[1] - over.best(i)[1] for i in every]
+        return float(np.mean(gains) / max(_error(gains), 1e-12))
 
     # by the channel that is explained: both are not equally noisy
     gains = {"accel": gain(accel_smooth, accel_late), "speed": gain(speed_smooth, speed_late)}
@@ -184,11 +185,6 @@ def on_time(log: Log, late: LateChannel) -> tuple[Log, BoolArray]:
         moved[part] = values[part][np.where(wanted - time[before] <= time[after] - wanted, before, after)]
         have[part] = wanted <= time[-1]
     return replace(log, **{late.name: moved}), have
-
-
-def _ratio(without: list[float]) -> float:
-    """A gain over its standard error, from the values without each of the blocks."""
-    return float(np.mean(without) / max(_error(without), 1e-12))
 
 
 def _error(without: list[float]) -> float:

@@ -157,9 +157,10 @@ def propose(table: Table, *, map: Pairs = None, unit: Pairs = None) -> Proposal:
     stated = given_mapping(SignalMap(), map=map, unit=unit)
     given = stated.column
     columns = columns_of(table)
-    time, clock = _time([c for c in columns if c.name == given.get("time", c.name)])
-    if time is None or clock is None:
+    found_clock = _time([c for c in columns if c.name == given.get("time", c.name)])
+    if found_clock is None:
         return Proposal({}, (_no_time(table),))
+    time, clock = found_clock
     known = np.flatnonzero(np.isfinite(clock))
     parts = _parts(clock)
     doubts: list[str] = _twice(table)
@@ -222,7 +223,7 @@ def _states(columns: list[Column]) -> list[str]:
     return doubts
 
 
-def _time(columns: list[Column]) -> tuple[Proposed | None, FloatArray | None]:
+def _time(columns: list[Column]) -> tuple[Proposed, FloatArray] | None:
     """The clock: of the columns that rise at a rate a log can have, the one whose name fits best; seconds (row,)."""
     named = ranked(columns, "time")
     for column in [*named, *(c for c in columns if c not in named)]:
@@ -242,7 +243,7 @@ def _time(columns: list[Column]) -> tuple[Proposed | None, FloatArray | None]:
             if stated is not None and stated != unit:
                 why += f", which its {stated} would not give"
         return Proposed(column.name, None if unit == "s" else unit, False, why), column.values / _TICKS[unit]
-    return None, None
+    return None
 
 
 def _parts(clock: FloatArray) -> list[slice]:
@@ -273,32 +274,26 @@ def _units(
     if not found:
         return {}
     stated = {signal: _stated(signal, column) for signal, column in found.items()}
-    test = units_together(clock, {signal: filled(column) for signal, column in found.items()}, stated, parts)
+    best, rival, scales = units_together(clock, {signal: filled(c) for signal, c in found.items()}, stated, parts)
     units: dict[str, str] = {}
-    for signal, unit in test.best.units.items():
-        turned = signal in test.best.turned
+    for signal, (unit, turned) in best.items():
         told = stated[signal]
         # the file states it, so a table need not say it again, unless it is wrong
         if unit not in ("m/s", "m/s2") or turned or told not in (unit, None):
             units[signal] = f"{-factor(signal, unit):.10g}" if turned else unit
-        words = []
-        if told == unit and found[signal].name == signal:
-            pass
-        elif told == unit:
-            words.append(f"in {unit} by its header")
+        if told == unit:
+            reasons[signal] += [] if found[signal].name == signal else [f"in {unit} by its header"]
         elif told is not None:
-            words.append(f"in {unit}, not the {told} of its header: {_proof(signal, test)}")
+            reasons[signal].append(f"in {unit}, not the {told} of its header: {_proof(signal, best, scales)}")
         elif unit not in ("m/s", "m/s2"):
-            words.append(f"in {unit}: {_proof(signal, test)}")
+            reasons[signal].append(f"in {unit}: {_proof(signal, best, scales)}")
         if turned:
-            words.append("with its sign reversed, as the motion has the other one")
-        reasons[signal] += words
-    if test.rival is not None:
-        best, rival = test.best, test.rival
+            reasons[signal].append("with its sign reversed, as the motion has the other one")
+    if rival is not None:
         differ = [
-            f"{signal} in {rival.units[signal]}{' reversed' if signal in rival.turned else ''}"
-            for signal in best.units
-            if rival.units[signal] != best.units[signal] or (signal in rival.turned) != (signal in best.turned)
+            f"{signal} in {unit}{' reversed' if turned else ''}"
+            for signal, (unit, turned) in rival.items()
+            if (unit, turned) != best[signal]
         ]
         doubts.append(f"the data allow {' with '.join(differ)} nearly as well")
     return units
@@ -310,11 +305,11 @@ def _stated(signal: str, column: Column) -> str | None:
     return column.header.unit or bare_unit(column.header, signal) or si
 
 
-def _proof(signal: str, test: UnitTest) -> str:
+def _proof(signal: str, units: Units, scales: Scales) -> str:
     """What of the data decides a unit."""
-    for (level, rate), scale in test.scales.items():
+    for (level, rate), scale in scales.items():
         if signal in (level, rate):
-            sizes = factor(level, test.best.units[level]) / factor(rate, test.best.units[rate])
+            sizes = factor(level, units[level][0]) / factor(rate, units[rate][0])
             return f"{level} then changes {abs(scale.slope) * sizes:.2f} times as {rate} says"
     return "its size is then a car's"
 
@@ -395,73 +390,49 @@ _SPEED_MPS, _SPEED_SPREAD = 35.0, 8.0  # of the 99th percentile, above which spe
 _ACCEL_MPS2, _ACCEL_SPREAD = 0.8, 1.2
 
 
-@dataclass(frozen=True)
-class UnitChoice:
-    """A unit for each of the signals, as `avtorch.io.units` names it; its `cost` in nats; `turned` signals."""
-
-    units: Mapping[str, str]
-    cost: float
-    turned: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class UnitTest:
-    """The best choice, the next one with other units if the data do not rule it out, and the scales it rests on."""
-
-    best: UnitChoice
-    rival: UnitChoice | None
-    scales: Mapping[tuple[str, str], Scale]
+Units = Mapping[str, tuple[str, bool]]
+"""By signal its unit, as `avtorch.io.units` names it, and whether its sign is reversed."""
+Scales = Mapping[tuple[str, str], Scale]
+"""By two signals: change of the first per integral of the second."""
 
 
 def units_together(
     time: FloatArray, signals: Mapping[str, FloatArray], stated: Mapping[str, str | None], parts: list[slice]
-) -> UnitTest:
-    """The units of `signals` (row,), of `accel_cmd`, `accel` and `speed` those that are there, in their own units.
+) -> tuple[Units, Units | None, Scales]:
+    """The best units of `signals` (row,), of `accel_cmd`, `accel` and `speed` those that are there; the next best ones
+    where the data do not rule them out; and the scales, in the signals' own units, that both rest on.
 
     `time` (row,) [s]; `stated`: what headers say; `parts`: stretches of rows that may be compared.
     """
     scales = _scales(time, signals, parts)
-    options: dict[str, list[tuple[str, float, bool]]] = {}
+    options: dict[str, list[tuple[tuple[str, bool], float]]] = {}
     for name, values in signals.items():
-        rarity = _SPEED_UNITS if name == "speed" else _ACCEL_UNITS
         options[name] = []
-        for unit, rare in rarity.items():
+        for unit, rare in (_SPEED_UNITS if name == "speed" else _ACCEL_UNITS).items():
             told = stated.get(name)
             cost = (rare if told is None else 0.0 if unit == told else _STATED + rare) + _by_size(name, values, unit)
-            options[name] += [(unit, cost, False)] + ([] if name == "speed" else [(unit, cost + _TURNED, True)])
-    choices = []
+            options[name] += [((unit, False), cost)] + ([] if name == "speed" else [((unit, True), cost + _TURNED)])
+    choices: list[tuple[float, Units]] = []
     for combination in product(*options.values()):
-        of = dict(zip(options, combination, strict=True))
-        cost = sum(cost for _, cost, _ in combination) + _by_motion(of, scales)
-        both = [of[name][0] for name in ("accel_cmd", "accel") if name in of]
+        units = {name: unit for name, (unit, _) in zip(options, combination, strict=True)}
+        cost = sum(cost for _, cost in combination) + _by_motion(units, scales)
+        both = [units[name][0] for name in ("accel_cmd", "accel") if name in units]
         if len(both) == 2 and both[0] == both[1]:
             cost -= _ALIKE
-        turned = tuple(name for name, (_, _, turned) in of.items() if turned)
-        choices.append(UnitChoice({name: unit for name, (unit, _, _) in of.items()}, cost, turned))
-    choices.sort(key=lambda choice: choice.cost)
-    best = choices[0]
-    rival = next((c for c in choices[1:] if c.cost < best.cost + PLAIN), None)
-    return UnitTest(best, rival, scales)
+        choices.append((cost, units))
+    (least, best), *others = sorted(choices, key=lambda choice: choice[0])
+    return best, next((units for cost, units in others if cost < least + PLAIN), None), scales
 
 
-def _scales(time: FloatArray, signals: Mapping[str, FloatArray], parts: list[slice]) -> dict[tuple[str, str], Scale]:
-    """Raw scales between the signals: change of the first per integral of the second."""
-    found: dict[tuple[str, str], Scale] = {}
+def _scales(time: FloatArray, signals: Mapping[str, FloatArray], parts: list[slice]) -> Scales:
+    found: dict[tuple[str, str], Scale | None] = {}
     if "speed" in signals and "accel" in signals:
-        _keep(found, ("speed", "accel"), scale_between(time, parts, signals["speed"], signals["accel"]))
-    if "accel_cmd" in signals:
-        u = signals["accel_cmd"]
-        if "speed" in signals:
-            _keep(found, ("speed", "accel_cmd"), _response(time, parts, signals["speed"], u))
-        if "accel" in signals:
-            level = integral(time, signals["accel"])
-            _keep(found, ("accel", "accel_cmd"), _response(time, parts, level, u))
-    return found
-
-
-def _keep(found: dict[tuple[str, str], Scale], pair: tuple[str, str], scale: Scale | None) -> None:
-    if scale is not None and abs(scale.correlation) >= _SURE and scale.slope != 0:
-        found[pair] = scale
+        found["speed", "accel"] = scale_between(time, parts, signals["speed"], signals["accel"])
+    for name in ("speed", "accel") if "accel_cmd" in signals else ():
+        if name in signals:
+            level = signals[name] if name == "speed" else integral(time, signals[name])
+            found[name, "accel_cmd"] = _response(time, parts, level, signals["accel_cmd"])
+    return {pair: x for pair, x in found.items() if x is not None and abs(x.correlation) >= _SURE and x.slope != 0}
 
 
 def _response(time: FloatArray, parts: list[slice], level: FloatArray, u: FloatArray) -> Scale | None:
@@ -471,11 +442,11 @@ def _response(time: FloatArray, parts: list[slice], level: FloatArray, u: FloatA
     return found
 
 
-def _by_motion(of: Mapping[str, tuple[str, float, bool]], scales: Mapping[tuple[str, str], Scale]) -> float:
+def _by_motion(units: Units, scales: Scales) -> float:
     cost = 0.0
     for (level, rate), scale in scales.items():
-        signed = scale.slope * factor(level, of[level][0]) / factor(rate, of[rate][0])
-        signed *= (-1.0 if of[level][2] else 1.0) * (-1.0 if of[rate][2] else 1.0)
+        signed = scale.slope * factor(level, units[level][0]) / factor(rate, units[rate][0])
+        signed *= -1.0 if units[level][1] != units[rate][1] else 1.0
         weight = scale.correlation**2
         if signed <= 0:
             cost += _WORST * weight

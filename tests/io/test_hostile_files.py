@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import socket
 import tracemalloc
 from collections.abc import Callable, Iterator
@@ -20,6 +19,7 @@ from avtorch.io import Log, check, read_following, read_leader, tables, write_js
 from avtorch.io.tables import read_table
 
 from .drives import drive, write
+from .formats.survival import in_time
 
 GOOD = drive(seconds=4.0)
 HEAD = "time,accel_cmd,speed\n"
@@ -32,16 +32,8 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 @pytest.fixture(autouse=True)
 def _in_time() -> Iterator[None]:
-    """A reader that waits, or reads without end, fails its test and not the whole suite."""
-
-    def late(*_: object) -> None:
-        raise TimeoutError("still reading after 20 s")
-
-    before = signal.signal(signal.SIGALRM, late)
-    signal.alarm(20)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
+    with in_time():
+        yield
 
 
 def refused(read: Callable[[], object], *words: str) -> str:

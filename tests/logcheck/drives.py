@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
 import numpy as np
 
 Columns = dict[str, np.ndarray]
@@ -26,3 +29,13 @@ def drive(seed: int, seconds: float = 60.0, rate: float = 50.0) -> Columns:
         "accel": accel + 0.03 * rng.standard_normal(len(time)),
         "speed": speed + 0.02 * rng.standard_normal(len(time)),
     }
+
+
+def written(path: Path, columns: Mapping[str, Iterable[object]], *, before: str = "") -> Path:
+    """The columns as text, numbers in full; `before`: lines before the header."""
+    cells = (values.tolist() if isinstance(values, np.ndarray) else values for values in columns.values())
+    rows = zip(*cells, strict=True)
+    path.write_text(
+        before + "\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows)]), encoding="utf-8"
+    )
+    return path

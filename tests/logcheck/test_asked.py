@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,19 +14,7 @@ from avtorch.cli import main
 from avtorch.io import Log
 from avtorch.io import check as quality
 
-from .drives import GAIN, Columns, drive
-
-
-def written(path: Path, columns: Mapping[str, Sequence[object]]) -> Path:
-    rows = zip(
-        *((repr(x) if isinstance(x, float) else str(x) for x in values) for values in columns.values()), strict=True
-    )
-    path.write_text("\n".join([",".join(columns), *map(",".join, rows)]), encoding="utf-8")
-    return path
-
-
-def lists(columns: Columns) -> dict[str, list[float]]:
-    return {name: values.tolist() for name, values in columns.items()}
+from .drives import GAIN, drive, written
 
 
 def notes(log: Log) -> str:
@@ -93,7 +80,7 @@ def test_standstill_goes_with_what_was_driven(top: float, stands: float) -> None
 def test_a_log_of_which_too_little_is_left_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     time = np.arange(0.0, 60.0, 0.05)
     speed = np.where(time % 10 < 1.5, 1.0, 0.0)
-    path = written(tmp_path / "stop.csv", lists({"time": time, "accel_cmd": np.sin(time), "speed": speed}))
+    path = written(tmp_path / "stop.csv", {"time": time, "accel_cmd": np.sin(time), "speed": speed})
     for command in (["check"], ["estimate", "--out", str(tmp_path / "e")], ["diagnose", "--out", str(tmp_path / "d")]):
         assert main([*command[:1], str(path), *command[1:]]) == 2
         seen = capsys.readouterr()
@@ -106,7 +93,7 @@ def test_a_log_of_which_too_little_is_left_says_so(tmp_path: Path, capsys: pytes
 def test_stamps_of_no_known_form_are_said_to_be_that(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     d = drive(1, seconds=20.0, rate=20.0)
     stamps = [f"2024_04_23_12_31_{int(t):02d}_{round(1000 * (t % 1))}" for t in d["time"].tolist()]
-    columns = {"stamp": stamps, **{name: [repr(x) for x in d[name].tolist()] for name in ("accel_cmd", "speed")}}
+    columns = {"stamp": stamps, "accel_cmd": d["accel_cmd"], "speed": d["speed"]}
     path = written(tmp_path / "headed.csv", columns)
     for command in (["check"], ["estimate", "--map", "time=stamp", "--out", str(tmp_path / "e")]):
         assert main([*command[:1], str(path), *command[1:]]) == 2
@@ -120,9 +107,9 @@ def test_a_stamp_in_two_columns_is_one(seconds: str, nanoseconds: str, tmp_path:
     d = drive(1)
     whole = np.floor(d["time"])
     columns = {
-        f"header.stamp.{seconds}": (1_700_000_000 + whole.astype(int)).tolist(),
-        f"header.stamp.{nanoseconds}": np.round((d["time"] - whole) * 1e9).astype(int).tolist(),
-        **{name: d[name].tolist() for name in ("accel_cmd", "accel", "speed")},
+        f"header.stamp.{seconds}": 1_700_000_000 + whole.astype(int),
+        f"header.stamp.{nanoseconds}": np.round((d["time"] - whole) * 1e9).astype(int),
+        **{name: d[name] for name in ("accel_cmd", "accel", "speed")},
     }
     path = written(tmp_path / "bag.csv", columns)
     found = avtorch.check(path)
@@ -136,7 +123,7 @@ def test_a_stamp_in_two_columns_is_one(seconds: str, nanoseconds: str, tmp_path:
 def test_names_in_errors_are_whole(tmp_path: Path) -> None:
     d = drive(1)
     name = "/vehicle/status/velocity_status/longitudinal_velocity_filtered"
-    path = written(tmp_path / "bag.csv", lists({"time": d["time"], name: d["speed"], "accel_cmd": d["accel_cmd"]}))
+    path = written(tmp_path / "bag.csv", {"time": d["time"], name: d["speed"], "accel_cmd": d["accel_cmd"]})
     with pytest.raises(InputError, match=name):
         Log.read(path)
 
@@ -148,9 +135,9 @@ def robot(folder: Path, *, columns: bool) -> list[str]:
     speed = np.convolve(asked, np.full(10, 0.1), mode="full")[: len(time)]
     car = {"time": time, "speed_cmd": asked, "speed": speed}
     if columns:
-        return [str(written(folder / "both.csv", lists(car | {"sim.speed": asked}))), "--simulated", "sim."]
-    simulated = written(folder / "sim.csv", lists({"time": time, "speed_cmd": asked, "speed": asked}))
-    return [str(written(folder / "car.csv", lists(car))), "--simulated", str(simulated)]
+        return [str(written(folder / "both.csv", car | {"sim.speed": asked})), "--simulated", "sim."]
+    simulated = written(folder / "sim.csv", {"time": time, "speed_cmd": asked, "speed": asked})
+    return [str(written(folder / "car.csv", car)), "--simulated", str(simulated)]
 
 
 @pytest.mark.parametrize("columns", [False, True])

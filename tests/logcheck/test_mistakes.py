@@ -12,7 +12,7 @@ import avtorch
 from avtorch.io import Log
 from avtorch.io.units import GRAVITY
 
-from .drives import Columns, drive
+from .drives import Columns, drive, written
 
 MPH = 3600 / 1609.344
 
@@ -63,10 +63,7 @@ def test_a_mistake_is_corrected_and_told(mistake: str, tmp_path: Path, fresh_see
     right = drive(fresh_seed)
     wrong = MISTAKES[mistake](right)
     wrong["note"] = np.random.default_rng(fresh_seed).standard_normal(len(right["time"]))
-    path = tmp_path / "drive.csv"
-    rows = zip(*(map(repr, values.tolist()) for values in wrong.values()), strict=True)
-    path.write_text("\n".join([",".join(wrong), *(",".join(row) for row in rows)]), encoding="utf-8")
-
+    path = written(tmp_path / "drive.csv", wrong)
     found = avtorch.check(path)
     assert found.fault is None
     assert found.proposal is not None
@@ -96,9 +93,7 @@ def test_units_that_the_data_cannot_tell_apart_are_told(tmp_path: Path, fresh_se
     """cm/s² and thousandths of g differ by 2 %."""
     log = Log.from_arrays(**drive(fresh_seed))
     columns = {"time": log.time, "accel_cmd": log.accel_cmd, "accel": 100.0 * log.accel, "speed": log.speed}
-    rows = zip(*(map(repr, values.tolist()) for values in columns.values()), strict=True)
-    (tmp_path / "drive.csv").write_text("\n".join([",".join(columns), *(",".join(row) for row in rows)]))
-    found = avtorch.check(tmp_path / "drive.csv")
+    found = avtorch.check(written(tmp_path / "drive.csv", columns))
     assert found.proposal is not None
     assert found.proposal.unit["accel"] in ("mg", "cm/s2")
     assert any("the data allow accel in" in doubt for doubt in found.proposal.doubts)
@@ -110,12 +105,8 @@ def test_units_that_the_data_cannot_tell_apart_are_told(tmp_path: Path, fresh_se
 
 def test_a_signal_that_arrives_now_and_then_is_held(tmp_path: Path, fresh_seed: int) -> None:
     d = drive(fresh_seed)
-    rows = [
-        f"{t!r},{u!r},{a!r},{v!r}" if i % 5 == 0 else f"{t!r},{u!r},{a!r},"
-        for i, (t, u, a, v) in enumerate(zip(*(x.tolist() for x in d.values()), strict=True))
-    ]
-    (tmp_path / "drive.csv").write_text("\n".join([",".join(d), *rows]))
-    found = avtorch.check(tmp_path / "drive.csv")
+    speed = [v if i % 5 == 0 else "" for i, v in enumerate(d["speed"].tolist())]
+    found = avtorch.check(written(tmp_path / "drive.csv", {**d, "speed": speed}))
     assert found.proposal is not None
     assert found.proposal.stamp == {"speed": "time"}
     assert "written in 20% of the rows" in found.proposal.signals["speed"].reason

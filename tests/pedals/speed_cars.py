@@ -37,16 +37,9 @@ def drive(
     wind = np.zeros(len(time))
     for i in range(1, len(time)):
         wind[i] = wind[i - 1] * kept + force * np.sqrt(2 * DT / 3) * rng.standard_normal()
-    speed, demands, v, a, summed, late = (
-        np.empty(len(time)),
-        np.empty(len(time)),
-        wish[0],
-        0.0,
-        0.0,
-        round(DELAY_S / DT),
-    )
+    speed, demands = np.empty(len(time)), np.empty(len(time))
+    v, a, summed, late = wish[0], 0.0, 0.0, round(DELAY_S / DT)
     for i in range(len(time)):
-        speed[i] = v
         seen = v + noise * rng.standard_normal()  # the log holds what the controller sees
         speed[i] = seen
         summed += integral * DT * (wish[i] - seen)

@@ -1,6 +1,9 @@
-"""A known map is found again, within the errors that the fit itself states, with the lag and dead time behind it."""
+"""A known map is found again, within the errors that the fit itself states, with the lag and dead time behind it; on
+blocks left out it scores better than one constant a pedal where the car has a map, and not where it has none."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,9 +11,11 @@ import pytest
 from avtorch.errors import InputError
 from avtorch.io import Log
 from avtorch.pedals import PedalFit, fit_pedals
-from tests.pedals.cars import DEAD_ZONE, DELAY_S, LAG_S, drive, plain, with_dead_zone, with_motor_brake
+from benchmarks.pedals import RECORDINGS, read
+from tests.pedals.cars import DEAD_ZONE, DELAY_S, LAG_S, drive, factors, plain, with_dead_zone, with_motor_brake
 
 SEED = 11
+QUICK = "roboracer, one mass"
 
 
 @pytest.fixture(scope="module")
@@ -112,3 +117,20 @@ def test_what_no_map_can_be_fitted_to(columns: dict, told: str) -> None:
 def test_a_short_drive_is_refused() -> None:
     with pytest.raises(InputError, match="found 2 blocks of some seconds that count, needs 3 for a map"):
         fit_pedals(drive(plain, 6, seconds=8.0))
+
+
+def test_a_map_beats_one_factor_where_the_car_has_one() -> None:
+    assert fit_pedals(drive(with_dead_zone, 21, seconds=100.0)).held_out.better_than("factor")
+
+
+def test_a_map_is_not_said_to_beat_the_factor_that_the_car_is() -> None:
+    score = fit_pedals(drive(factors, 22, seconds=100.0)).held_out
+    assert not score.better_than("factor")
+    # wind and road foretell nothing, and that is all that is left
+    assert score.rmse("map") < 0.6
+
+
+@pytest.mark.parametrize("name", [n if n == QUICK else pytest.param(n, marks=pytest.mark.slow) for n in RECORDINGS])
+def test_on_recordings_a_map_beats_one_factor(name: str, data_dir: Path) -> None:
+    score = fit_pedals(read(name, data_dir)).held_out
+    assert score.rmse("map") < score.rmse("factor")

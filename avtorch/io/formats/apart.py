@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from avtorch.errors import InputError
-from avtorch.io.formats.kinds import PARQUET, Kind
+from avtorch.io.formats.kinds import NEED, PARQUET, Kind, kind_at
 from avtorch.io.formats.listed import Channel, Recording
 from avtorch.io.opening import place
 
@@ -31,11 +31,20 @@ MOST_SECONDS, SECONDS_PER_MIB = 60.0, 1.0
 """For each request, by the size of the file: a workbook of 20 million cells takes a third of that."""
 
 
-def open_apart(path: str | os.PathLike[str], kind: Kind, names: Collection[str] = ()) -> Recording:
-    """Open a recording by a process of its own; what it has of `names` comes along, other channels by another process.
+def open_recording(path: str | os.PathLike[str], names: Collection[str] = ()) -> Recording:
+    """Open a recording; its format is recognised by how it begins, then by its suffix.
 
-    Raises InputError, also where a process ends or takes too long.
+    A CAN log is decoded by the ``.dbc`` of its name beside it, or the only one in its folder. Names are listed and no
+    samples are read, except where a format has to be read to be listed (MAT before 7.3, Excel). What it has of `names`
+    is read as it is opened, other channels by another process.
+
+    Raises InputError naming the file: for what is no regular file or no recording, for a damaged one, for one whose
+    library is not installed (with the command that installs it), and for a CAN log without a database.
     """
+    kind = kind_at(path)
+    if kind is None:
+        what = "a directory without the metadata.yaml of a ROS 2 bag" if os.path.isdir(path) else "no recording"
+        raise InputError(f"{place(path)}: is {what}; {NEED} is needed")
     listing, first = _asked(path, kind, names)
     there = _channels(listing, first)
 

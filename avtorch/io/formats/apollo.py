@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.formats.kinds import Kind, guarded, library
-from avtorch.io.formats.listed import Piece, Recording, topic_recording
+from avtorch.io.formats.listed import Recording, Row, topic_recording
 from avtorch.io.opening import place
 
 _NEED = "an undamaged Apollo record, closed by its recorder or by `cyber_recorder recover`,"
@@ -46,7 +46,7 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
             for field in _numeric_fields(message.DESCRIPTOR):
                 fields.setdefault(f"{name}/{'/'.join(field)}", (name, field))
 
-    def collect(paths: Mapping[str, Sequence[Path]], pieces: Mapping[str, Piece]) -> None:
+    def messages(paths: Mapping[str, Sequence[Path]]) -> Iterator[Row]:
         by_raw = {topics[name][0]: name for name in paths}
         topic = ""
 
@@ -57,11 +57,11 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
             for topic, message, at in record.read_messages(set(by_raw)):
                 name = by_raw[topic]
                 stamp = topics[name][1]
-                row = [_value_at(message, path) for path in paths[name]]
-                pieces[name].take(row, at / 1e9, None if stamp is None else _value_at(message, stamp))
+                numbers = [_value_at(message, path) for path in paths[name]]
+                yield name, numbers, at / 1e9, math.nan if stamp is None else _value_at(message, stamp)
 
     remarks = [f"topics left out, the record does not define their type: {listed(left)}"] if left else []
-    return topic_recording(source, kind.words, fields, remarks, collect)
+    return topic_recording(source, kind.words, fields, remarks, messages)
 
 
 def _numeric_fields(descriptor: Any, before: Path = ()) -> list[Path]:

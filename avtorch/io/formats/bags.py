@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from operator import attrgetter
@@ -13,7 +15,7 @@ from typing import Any
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.formats import kinds
 from avtorch.io.formats.kinds import Kind, guarded, library
-from avtorch.io.formats.listed import Piece, Recording, topic_recording
+from avtorch.io.formats.listed import Recording, Row, topic_recording
 from avtorch.io.opening import place
 
 _NEED = "an undamaged ROS bag with its index (`rosbag reindex` or `mcap recover` mends one that was cut off)"
@@ -74,26 +76,26 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
             return store
         return topic.stores[-1]
 
-    def collect(paths: Mapping[str, Sequence[str]], pieces: Mapping[str, Piece]) -> None:
-        takers = {name: _taker(topics[name], own, pieces[name]) for name, own in paths.items()}
-        stores: dict[str, Any] = {}  # of the types, found by a topic's first message
+    def messages(paths: Mapping[str, Sequence[str]]) -> Iterator[Row]:
         by_connection = {(c.topic, c.id): name for name in paths for c in topics[name].connections}
-        name = ""
+        fields = {topic: attrgetter(own[0], *own) for topic, own in paths.items()}  # a tuple for one field, too
+        stores: dict[str, Any] = {}  # of the types, found by a topic's first message
+        count, name = Counter[str](), ""
 
         def where() -> str:
-            at = f": topic {quoted(name, 80)}: message {len(pieces[name].logged) + 1}" if name else ""
-            return f"{source}{at}"
+            return f"{source}: topic {quoted(name, 80)}: message {count[name]}" if name else source
 
         with guarded(where, _NEED):
-            connections = [c for name in paths for c in topics[name].connections]
-            for connection, at, raw in reader.messages(connections):
+            for connection, at, raw in reader.messages([c for topic in paths for c in topics[topic].connections]):
                 name = by_connection[connection.topic, connection.id]
+                count[name] += 1
                 if name not in stores:
                     stores[name] = fitting(topics[name], raw)
-                takers[name](decoded(stores[name], raw, topics[name].type), at)
+                message = decoded(stores[name], raw, topics[name].type)
+                yield name, tuple(map(float, fields[name](message)[1:])), at / _NANO, _stamp_of(message, topics[name])
 
     remarks = [f"topics left out, their type is unknown or differs: {listed(left)}"] if left else []
-    return topic_recording(source, kind.words, fields, remarks, collect)
+    return topic_recording(source, kind.words, fields, remarks, messages)
 
 
 def _opened(file: Path, kind: Kind, source: str) -> Any:
@@ -109,17 +111,12 @@ def _opened(file: Path, kind: Kind, source: str) -> Any:
     return reader
 
 
-def _taker(topic: _Topic, paths: Sequence[str], piece: Piece) -> Callable[[Any, int], None]:
-    """Puts a message that was recorded at a time [ns] into the piece."""
-    fields = attrgetter(paths[0], *paths)  # a tuple for one field, too
-    stamp = attrgetter(topic.stamp) if topic.stamp else None
-
-    def take(message: Any, at: int) -> None:
-        moment = None if stamp is None else stamp(message)
-        stamped = None if moment is None else (moment.sec * _NANO + moment.nanosec) / _NANO
-        piece.take(fields(message)[1:], at / _NANO, stamped)
-
-    return take
+def _stamp_of(message: Any, topic: _Topic) -> float:
+    """The stamp of a message [s], NaN where its type has none."""
+    if topic.stamp is None:
+        return math.nan
+    moment = attrgetter(topic.stamp)(message)
+    return (moment.sec * _NANO + moment.nanosec) / _NANO
 
 
 def _stores_of(typesys: Any) -> Callable[[str, Any], tuple[Any, ...]]:

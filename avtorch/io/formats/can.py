@@ -6,7 +6,6 @@ import io
 import os
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +24,8 @@ _MOST_DBC = 2**24  # bytes of a DBC
 Identifier = tuple[int, bool]
 
 
-@dataclass(frozen=True)
-class _Message:
-    """One message of a database, with the channels of its signals by the signals' names."""
-
-    message: Any
-    channels: dict[str, str]
+Message = tuple[Any, dict[str, str]]
+"""One message of a database, and the channels of its signals by the signals' names."""
 
 
 def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
@@ -46,7 +41,7 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
     messages, units = _messages_of(_database_of(Path(path), source), source, kind)
     frames = _Frames(Path(path), kind, source)
     present = {key: own for key, own in messages.items() if key in frames.bus}
-    names = [name for own in present.values() for one in own for name in one.channels.values()]
+    names = [name for own in present.values() for _, channels in own for name in channels.values()]
     if not names:
         known = listed(f"{number:X}" for number, _ in messages)
         seen = listed(f"{number:X}" for number, _ in sorted(frames.bus))
@@ -56,24 +51,21 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
 
     def load(asked: tuple[str, ...]) -> dict[str, Channel]:
         columns = {name: (array("d"), array("d")) for name in asked}
-        wanted = {
-            key: [one for one in own if not columns.keys().isdisjoint(one.channels.values())]
-            for key, own in present.items()
-        }
+        wanted = {key: [m for m in own if not columns.keys().isdisjoint(m[1].values())] for key, own in present.items()}
         for number, key, frame in frames.read({key for key, own in wanted.items() if own}):
-            for one in wanted[key]:
+            for message, channels in wanted[key]:
                 try:
-                    values = one.message.decode(
+                    values = message.decode(
                         bytes(frame.data), decode_choices=False, allow_truncated=True, decode_containers=False
                     )
                 except Exception as fault:
-                    name = next(iter(one.channels.values()))
+                    name = next(iter(channels.values()))
                     raise InputError(
                         f"{source}: channel {quoted(name, 80)}: frame {number} at {frame.timestamp:.6f} s cannot "
                         f"be decoded ({reason(fault)}); the database that belongs to the log is needed"
                     ) from None
                 for signal, value in values.items():
-                    if value is not None and (column := columns.get(one.channels.get(signal, ""))) is not None:
+                    if value is not None and (column := columns.get(channels.get(signal, ""))) is not None:
                         column[0].append(frame.timestamp)
                         column[1].append(value)
         return {
@@ -87,8 +79,13 @@ class _Frames:
     """The frames of a log. `bus` tells for each identifier the bus on which it came first."""
 
     def __init__(self, path: Path, kind: Kind, source: str) -> None:
-        self._path, self._kind, self._source = path, kind, source
+        self._kind, self._source = kind, source
         self.remarks: list[str] = []
+        self._raw = read_regular(path, most=MOST_BYTES, need=_NEED)
+        end = self._raw.rfind(b"\n") + 1
+        if kind is not kinds.BLF and self._raw[end:].strip():  # a number at the end may lack its last digits
+            self.remarks.append("the last line does not end; it is left out")
+            self._raw = self._raw[:end]
         self._most: int | None = None
         self.bus: dict[Identifier, Any] = {}
         others: set[Identifier] = set()
@@ -139,16 +136,10 @@ class _Frames:
 
     def _reader(self) -> tuple[Any, io.IOBase]:
         can = library("can.io", self._source, self._kind)
-        raw = read_regular(self._path, most=MOST_BYTES, need=_NEED)
+        stream = io.BytesIO(self._raw)
         if self._kind is kinds.BLF:
-            stream = io.BytesIO(raw)
             return can.BLFReader(stream), stream
-        end = raw.rfind(b"\n") + 1
-        if raw[end:].strip():  # a number at the end may lack its last digits
-            if self._most is None:
-                self.remarks.append("the last line does not end; it is left out")
-            raw = raw[:end]
-        text = io.TextIOWrapper(io.BytesIO(raw), encoding="utf-8", errors="replace")
+        text = io.TextIOWrapper(stream, encoding="utf-8", errors="replace")
         return (can.ASCReader if self._kind is kinds.ASC else can.CanutilsLogReader)(text), text
 
 
@@ -167,14 +158,14 @@ def _database_of(log: Path, source: str) -> Path:
     )
 
 
-def _messages_of(database: Path, source: str, kind: Kind) -> tuple[dict[Identifier, list[_Message]], dict[str, str]]:
+def _messages_of(database: Path, source: str, kind: Kind) -> tuple[dict[Identifier, list[Message]], dict[str, str]]:
     """Messages by identifier and whether that is an extended one, and the units of their channels.
 
     A channel is ``Message.Signal``; where another message has that name already, the identifier stands between.
     Raises InputError.
     """
     cantools = library("cantools.database", source, kind)
-    messages: dict[Identifier, list[_Message]] = {}
+    messages: dict[Identifier, list[Message]] = {}
     units: dict[str, str] = {}
     text = read_regular(database, most=_MOST_DBC, need=_NEED_DBC).decode("cp1252", errors="replace")
     with guarded(place(database), _NEED_DBC):
@@ -188,7 +179,7 @@ def _messages_of(database: Path, source: str, kind: Kind) -> tuple[dict[Identifi
             channels = {signal.name: prefix + signal.name for signal in message.signals}
             units |= {channels[signal.name]: signal.unit for signal in message.signals if signal.unit}
             key = (message.frame_id, bool(message.is_extended_frame))
-            messages.setdefault(key, []).append(_Message(message, channels))
+            messages.setdefault(key, []).append((message, channels))
     if not messages:
         raise InputError(f"{place(database)}: defines no message; {_NEED_DBC} is needed")
     return messages, units

@@ -22,9 +22,9 @@ from avtorch.io.formats.listed import Channel, Recording, refuse_cells
 from avtorch.io.formats.matlab import FINER, TIMES
 from avtorch.io.opening import MOST_BYTES, place, read_regular
 from avtorch.io.tables import Readings, Table, text_table
+from avtorch.io.units import factor, stated_unit
 
 _NEED = "an undamaged workbook"
-_SCALES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 _UNIT = re.compile(r"\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*$")
 
 
@@ -56,8 +56,8 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
             f"{source}: no column is called {', '.join(TIMES[:4])} or the like; a time column is needed; "
             f"columns: {listed(columns)}"
         )
-    stated = units.pop(plain[clock], "").strip("[]() ").lower()
-    time = columns.pop(plain[clock]).values * _SCALES.get(stated, FINER.get(clock, 1.0))
+    stated = stated_unit("time", units.pop(plain[clock], ""))
+    time = columns.pop(plain[clock]).values * (factor("time", stated) if stated else FINER.get(clock, 1.0))
     dated = ~np.isnan(time)
     time = time[dated]
     remarks = []

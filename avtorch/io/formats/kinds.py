@@ -21,18 +21,17 @@ from avtorch.io.opening import beginning, place
 
 @dataclass(frozen=True)
 class Kind:
-    """One format."""
+    """One format: what messages call it, and the module of this package that opens it; what brings its library, None
+    where avtorch's own requirements read it; suffixes in lower case, and how a file of it begins, in words.
+
+    A file of such a suffix that does not begin so is refused, not guessed at.
+    """
 
     words: str
-    """As messages call it."""
     reader: str
-    """The module of this package that opens it."""
     extra: str | None
-    """What brings its library; None where avtorch's own requirements read it."""
     suffixes: tuple[str, ...]
-    """In lower case. A file of this name that does not begin as the format does is refused, not guessed at."""
     begins: str
-    """How a file of this format begins, in words."""
 
 
 MDF = Kind("MDF", "mdf", "mdf", (".mf4", ".mdf", ".mf3"), "'MDF' or 'UnFinMF'")

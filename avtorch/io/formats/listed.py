@@ -6,7 +6,7 @@ A signal is listed before it is read, so that a file of thousands of signals cos
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,25 +73,8 @@ def refuse_cells(source: str, count: int) -> None:
         raise InputError(f"{source}: has {count:,} samples in the channels that are read; needs {MOST_CELLS:,} at most")
 
 
-class Piece:
-    """What is read of one topic: a column for each field, the times of recording, and the stamps [s]."""
-
-    def __init__(self, columns: int) -> None:
-        self.columns = [array("d") for _ in range(columns)]
-        self.logged, self.stamped = array("d"), array("d")
-
-    def take(self, row: Sequence[float], logged: float, stamp: float | None) -> None:
-        """One message: its fields, when it was recorded, and the stamp where its type has one."""
-        for column, value in zip(self.columns, row, strict=True):
-            column.append(value)
-        self.logged.append(logged)
-        if stamp is not None:
-            self.stamped.append(stamp)
-
-    def time(self) -> FloatArray:
-        """The stamps, or the times of recording where a message has none or does not set it."""
-        stamped = np.array(self.stamped, dtype=np.float64)
-        return stamped if len(stamped) and (stamped > 0).all() else np.array(self.logged, dtype=np.float64)
+Row = tuple[str, Sequence[float], float, float]
+"""A message: its topic, the numbers asked for, when it was recorded, and its own stamp [s], NaN where it has none."""
 
 
 def topic_recording(
@@ -99,12 +82,13 @@ def topic_recording(
     form: str,
     fields: Mapping[str, tuple[str, Any]],
     remarks: Sequence[str],
-    collect: Callable[[Mapping[str, Sequence[Any]], Mapping[str, Piece]], None],
+    messages: Callable[[Mapping[str, Sequence[Any]]], Iterator[Row]],
 ) -> Recording:
-    """A recording of topics of messages, all fields of one topic on one clock.
+    """A recording of topics of messages, all fields of one topic on one clock: the stamps of its messages, or the times
+    of recording where one has no stamp or does not set it.
 
-    `fields`: the topic and the path within its messages, by channel. `collect` puts the messages of topics into their
-    pieces, given the paths that are asked for by topic.
+    `fields`: the topic and the path within its messages, by channel. `messages` reads, given by topic the paths that
+    are asked for.
     """
     if len(fields) > MOST_COLUMNS:
         remarks = [*remarks, f"only the first {MOST_COLUMNS:,} fields are listed"]
@@ -114,13 +98,17 @@ def topic_recording(
         asked: dict[str, list[str]] = {}
         for name in names:
             asked.setdefault(fields[name][0], []).append(name)
-        pieces = {topic: Piece(len(own)) for topic, own in asked.items()}
-        collect({topic: [fields[name][1] for name in own] for topic, own in asked.items()}, pieces)
+        columns = {topic: [array("d") for _ in range(len(own) + 2)] for topic, own in asked.items()}
+        for topic, numbers, logged, stamp in messages(
+            {t: [fields[name][1] for name in own] for t, own in asked.items()}
+        ):
+            for column, number in zip(columns[topic], (*numbers, logged, stamp), strict=True):
+                column.append(number)
         found = {}
-        for topic, piece in pieces.items():
-            time = piece.time()
-            for name, column in zip(asked[topic], piece.columns, strict=True):
-                found[name] = Channel(name, time, np.array(column, dtype=np.float64))
+        for topic, own in asked.items():
+            *values, logged, stamps = (np.array(column, dtype=np.float64) for column in columns[topic])
+            time = stamps if len(stamps) and (stamps > 0).all() else logged
+            found |= {name: Channel(name, time, x) for name, x in zip(own, values, strict=True)}
         return found
 
     return Recording(source, form, fields, {}, remarks, load)

@@ -10,7 +10,6 @@ import importlib.util
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -41,13 +40,8 @@ Tree: TypeAlias = "Mapping[str, Any | Tree]"
 """Structs within structs; leaves are arrays, or datasets of HDF5 that are not read yet."""
 
 
-@dataclass(frozen=True, eq=False)
-class Series:
-    """One channel: its `values` and its `time`, vectors of a file, and the time's unit [s]."""
-
-    values: Any
-    time: Any
-    scale: float
+Clock: TypeAlias = tuple[str, Any, float]
+"""A vector of times: its name, its leaf, and its unit [s]."""
 
 
 def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
@@ -63,30 +57,28 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
     with guarded(source, _NEED):
         tree = opener(path, kind, objects)
         also, lost = _tables(path, [name for name in objects if "." in name]) if objects else ({}, [])
-        found = _Found()
-        found.visit({**tree, **also}, "", None, 0)
-    if not found.series:
-        there = f"; vectors without one: {listed(found.untimed)}" if found.untimed else ""
+        series, untimed = _series({**tree, **also})
+    if not series:
+        there = f"; vectors without one: {listed(untimed)}" if untimed else ""
         raise InputError(
             f"{source}: has no signal with a time{there}; a time vector is needed beside the signals, called "
             f"{', '.join(TIMES[:4])}"
         )
 
     def load(names: tuple[str, ...]) -> dict[str, Channel]:
-        refuse_cells(source, sum(_length(found.series[name].time) for name in names))
+        refuse_cells(source, sum(_length(series[name][0]) for name in names))
         times: dict[tuple[int, float], FloatArray] = {}  # read once for all channels that have it
         channels = {}
         for name in names:
-            series = found.series[name]
-            key = (id(series.time), series.scale)
+            values, (_, time, unit) = series[name]
             with guarded(f"{source}: channel {quoted(name, 80)}", _NEED):
-                if key not in times:
-                    times[key] = vector(series.time) * series.scale
-                channels[name] = Channel(name, times[key], vector(series.values))
+                if (id(time), unit) not in times:
+                    times[id(time), unit] = vector(time) * unit
+                channels[name] = Channel(name, times[id(time), unit], vector(values))
         return channels
 
-    untimed = [f"left out, no time goes with them: {listed(found.untimed)}"] if found.untimed else []
-    return Recording(source, form, found.series, {}, untimed + lost, load)
+    left = [f"left out, no time goes with them: {listed(untimed)}"] if untimed else []
+    return Recording(source, form, series, {}, left + lost, load)
 
 
 def vector(leaf: Any) -> FloatArray:
@@ -211,34 +203,34 @@ def _seconds(values: np.ndarray) -> np.ndarray | None:
     return values.astype("timedelta64[ns]" if values.dtype.kind == "m" else "datetime64[ns]").astype(np.int64) * 1e-9
 
 
-@dataclass
-class _Found:
-    """Channels by name, and the paths of those vectors that no time goes with."""
+def _series(tree: Tree) -> tuple[dict[str, tuple[Any, Clock]], list[str]]:
+    """Vectors with their clocks by path, 10,000 at most, and the paths of those that no time goes with."""
+    series: dict[str, tuple[Any, Clock]] = {}
+    untimed: list[str] = []
 
-    series: dict[str, Series] = field(default_factory=dict)
-    untimed: list[str] = field(default_factory=list)
-
-    def visit(self, tree: Tree, path: str, outer: tuple[str, Any, float] | None, depth: int) -> None:
-        """Take in the vectors of a tree; `outer`: name, numbers and unit [s] of the time around it."""
-        if depth > _DEEPEST or len(self.series) >= MOST_COLUMNS:
+    def visit(tree: Tree, path: str, outer: Clock | None, depth: int) -> None:
+        if depth > _DEEPEST or len(series) >= MOST_COLUMNS:
             return
         own = _clock(tree)
         clock = own or outer
-        values = [name for name in tree if own is None or name != own[0]]
-        for name in values:
+        names = [name for name in tree if own is None or name != own[0]]
+        for name in names:
             item = tree[name]
             full = f"{path}.{name}" if path else name
             if isinstance(item, Mapping):
-                self.visit(item, full, clock, depth + 1)
+                visit(item, full, clock, depth + 1)
             elif clock is not None and _is_vector(item) and _length(item) == _length(clock[1]) > 1:
                 # a struct of Time and Data alone is one signal, called as the struct is
-                alone = path and own is not None and len(values) == 1 and name.lower() in ("data", "values", "value")
-                self.series[path if alone else full] = Series(item, *clock[1:])
+                alone = path and own is not None and len(names) == 1 and name.lower() in ("data", "values", "value")
+                series[path if alone else full] = item, clock
             elif _length(item) > 1:
-                self.untimed.append(full)
+                untimed.append(full)
+
+    visit(tree, "", None, 0)
+    return series, untimed
 
 
-def _clock(tree: Tree) -> tuple[str, Any, float] | None:
+def _clock(tree: Tree) -> Clock | None:
     lower = {name.lower(): name for name in reversed(list(tree))}
     for wanted, scale in [*((name, 1.0) for name in TIMES), *FINER.items()]:
         name = lower.get(wanted)

@@ -35,10 +35,11 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
     source = place(path)
     asammdf = library("asammdf", source, kind)
     remarks = []
-    # asammdf completes an unfinished file in place, so it gets a copy in memory
     unfinished = beginning(path, 8, need=_NEED).startswith(b"UnFin")
     with guarded(source, _NEED):
-        stream = _in_memory(path) if unfinished else opened(path, need=_NEED)
+        stream = opened(path, need=_NEED)
+        if unfinished:  # asammdf completes it in place, so it gets a copy in memory
+            stream = io.BytesIO(read_regular(path, most=MOST_BYTES, need=_NEED))
         try:
             mdf = _loaded(asammdf, stream, whole=True)
         except asammdf.blocks.utils.MdfException as fault:
@@ -73,10 +74,6 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> Recording:
         return channels
 
     return Recording(source, f"MDF {mdf.version}", places, units, remarks + left, load)
-
-
-def _in_memory(path: str | os.PathLike[str]) -> io.BytesIO:
-    return io.BytesIO(read_regular(path, most=MOST_BYTES, need=_NEED))
 
 
 def _loaded(asammdf: Any, stream: BinaryIO, *, whole: bool) -> Any:

@@ -9,7 +9,11 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from pyarrow import types
 
 from avtorch.errors import InputError, printable, quoted
 from avtorch.io.formats.kinds import Kind, guarded
@@ -19,28 +23,20 @@ _NEED = "an undamaged Parquet file"
 MOST_TEXT = 100
 """Bytes of the longest text that can be a number."""
 
-Cells = Sequence[Any] | NDArray
-
 
 def is_text(kind: Any) -> bool:
     """Whether an Arrow type is of text."""
-    from pyarrow import types
-
     views = filter(None, (getattr(types, "is_string_view", None),))
     return any(check(kind) for check in (types.is_string, types.is_large_string, *views))
 
 
 def is_time(kind: Any) -> bool:
     """Whether an Arrow type is of dates with times or of spans."""
-    from pyarrow import types
-
     return types.is_timestamp(kind) or types.is_duration(kind)
 
 
 def readable(kind: Any) -> bool:
     """Whether a column of an Arrow type can hold numbers or times."""
-    from pyarrow import types
-
     kind = kind.value_type if types.is_dictionary(kind) else kind
     numbers = types.is_integer, types.is_floating, types.is_boolean, types.is_decimal, types.is_null
     return is_text(kind) or is_time(kind) or any(check(kind) for check in numbers)
@@ -48,31 +44,25 @@ def readable(kind: Any) -> bool:
 
 def short_texts(column: Any, where: str) -> Any:
     """A column without Arrow's dictionary. InputError where its texts are too long for numbers."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    if pa.types.is_dictionary(column.type):
-        texts = [chunk.dictionary for chunk in column.chunks] if is_text(column.type.value_type) else []
-    else:
-        texts = [column] if is_text(column.type) else []
-    for text in texts:
+    kind, texts = column.type, [column]
+    if types.is_dictionary(kind):
+        kind, texts = kind.value_type, [chunk.dictionary for chunk in column.chunks]
+    for text in texts if is_text(kind) else ():
         longest = pc.max(pc.binary_length(text)).as_py() or 0  # pyright: ignore[reportAttributeAccessIssue]
         if longest > MOST_TEXT:
             raise InputError(f"{where}: holds texts of {longest:,} bytes; numbers are needed")
-    return column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
+    return column.cast(kind)
 
 
-def cells_of(column: Any, where: str) -> Cells:
+def cells_of(column: Any, where: str) -> Sequence[Any] | NDArray:
     """The cells of a column; a time stamp brings its own unit and becomes seconds since its epoch."""
-    import pyarrow as pa
-
-    if pa.types.is_dictionary(column.type):
+    if types.is_dictionary(column.type):
         column = short_texts(column, where)
     kind = column.type
     if is_time(kind):
         ticks = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[kind.unit]
         return [None if x is None else x / ticks for x in column.cast(pa.int64()).to_pylist()]
-    if column.null_count == 0 and (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+    if column.null_count == 0 and (types.is_integer(kind) or types.is_floating(kind)):
         return np.asarray(column.to_numpy(), dtype=np.float64)
     # text, booleans, decimals and empty cells go through the same careful reading as a CSV
     return column.to_pylist()
@@ -94,18 +84,6 @@ class ParquetFile:
         Raises InputError for more than 20 million cells, for columns that hold no numbers, times or short texts, and
         for damaged ones.
         """
-        import pyarrow as pa
-
-        with guarded(self.source, _NEED):
-            table = self._table(wanted)
-            out = io.BytesIO()
-            with pa.ipc.new_stream(out, table.schema) as writer:
-                writer.write_table(table)
-            return out.getvalue()
-
-    def _table(self, wanted: Collection[str]) -> Any:
-        import pyarrow as pa
-
         count, rows, schema = Counter(self.names), self._file.metadata.num_rows, self._file.schema_arrow
         kept = [name for name in self.names if name in wanted and count[name] == 1]
         if rows * max(1, len(kept)) > MOST_CELLS:
@@ -117,24 +95,23 @@ class ParquetFile:
             if not readable(kind := schema.field(name).type):
                 what = printable(str(kind), 40)
                 raise InputError(f"{self.source}: column {quoted(name)}: holds {what}; numbers are needed")
-        # a column is found by the first part of its path, so that one with a dot in its name comes along
-        found = self._file.read(columns=kept, use_threads=False)
-        if kept and found.num_rows != rows:
-            raise ValueError(f"{found.num_rows} rows where it declares {rows}")
-        columns = [
-            short_texts(found.column(found.schema.get_field_index(name)), f"{self.source}: column {quoted(name)}")
-            for name in kept
-        ]
-        table = pa.table(columns, names=kept)
-        table.validate(full=True)
-        return table
+        with guarded(self.source, _NEED):
+            # a column is found by the first part of its path, so that one with a dot in its name comes along
+            found = self._file.read(columns=kept, use_threads=False)
+            if kept and found.num_rows != rows:
+                raise ValueError(f"{found.num_rows} rows where it declares {rows}")
+            place_of = found.schema.get_field_index
+            texts = [short_texts(found.column(place_of(n)), f"{self.source}: column {quoted(n)}") for n in kept]
+            table = pa.table(texts, names=kept)
+            table.validate(full=True)
+            out = io.BytesIO()
+            with pa.ipc.new_stream(out, table.schema) as writer:
+                writer.write_table(table)
+            return out.getvalue()
 
 
 def open_file(path: str | os.PathLike[str], kind: Kind) -> ParquetFile:
     """Open a Parquet file and read its schema. Raises InputError."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     source = place(path)
     raw = read_regular(path, most=MOST_BYTES, need="a CSV or Parquet file")
     with guarded(source, _NEED):

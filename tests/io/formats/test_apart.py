@@ -13,6 +13,7 @@ from avtorch.io.formats import apart, open_recording
 
 from .survival import open_here
 from .test_bags import mcap
+from .test_can import DBC, candump
 from .test_excel import LOG, patched, xlsx
 from .test_matlab import LOG as STRUCTS
 from .test_matlab import mat5, mat73
@@ -42,6 +43,24 @@ def test_the_answers_are_those_of_the_reader(tmp_path: Path, form: str) -> None:
         assert found[name].values.flags.writeable
     # those that share a clock there share it here
     assert len({id(c.time) for c in found.values()}) == len({id(c.time) for c in expected.values()})
+
+
+@pytest.mark.parametrize("form", [*WRITERS, "log"])
+def test_a_channel_that_is_not_there_and_more_samples_than_a_reader_takes(
+    tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if form == "log":
+        (tmp_path / "drive.dbc").write_text(DBC)
+    recording = open_here((WRITERS | {"log": candump})[form](tmp_path / f"drive.{form}"))
+    with pytest.raises(InputError, match=r"drive\..*: channel 'sped' is missing; channels: "):
+        recording.read(["sped"])
+    samples = sum(len(channel.values) for channel in recording.read(recording.names).values())
+    monkeypatch.setattr("avtorch.io.formats.listed.MOST_CELLS", samples)
+    recording.read(recording.names)
+    monkeypatch.setattr("avtorch.io.formats.listed.MOST_CELLS", samples - 1)
+    what = f"has {samples:,} samples in the channels that are read; needs {samples - 1:,} at most"
+    with pytest.raises(InputError, match=what):
+        recording.read(recording.names)
 
 
 @pytest.mark.slow

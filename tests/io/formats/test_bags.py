@@ -295,14 +295,6 @@ def test_a_pipe_in_a_bags_folder_is_not_waited_for(tmp_path: Path, monkeypatch: 
         open_recording(path)
 
 
-def test_more_samples_than_a_reader_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recording = open_here(mcap(tmp_path / "drive.mcap"))
-    monkeypatch.setattr("avtorch.io.formats.listed.MOST_CELLS", 2 * COUNT - 1)
-    recording.read(["/state/mode"])
-    with pytest.raises(InputError, match="has 160 samples"):
-        recording.read(["/state/mode", "/cmd/twist/linear/x"])
-
-
 WRITERS: dict[str, Callable[[Path], Path]] = {"mcap": mcap, "db3": autoware, "bag": ros1}
 
 

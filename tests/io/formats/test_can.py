@@ -212,14 +212,6 @@ def test_a_log_cut_off_within_a_container_is_read_up_to_it(tmp_path: Path, base:
     assert 0 < len(recording.read(["Adas.Mode"])["Adas.Mode"].time) < whole
 
 
-def test_more_samples_than_a_reader_takes(tmp_path: Path, base: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recording = open_here(candump(tmp_path / "drive.log"))
-    monkeypatch.setattr("avtorch.io.formats.listed.MOST_CELLS", 2 * COUNT - 1)
-    recording.read(["Adas.Mode"])
-    with pytest.raises(InputError, match="has 600 samples"):
-        recording.read(["Adas.Mode", "Chassis.Speed"])
-
-
 HEADER = b"LOGG" + struct.pack("<I", 144) + bytes(136)
 
 

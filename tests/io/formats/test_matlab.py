@@ -154,13 +154,6 @@ def test_cells_within_cells_end(tmp_path: Path) -> None:
         open_recording(tmp_path / "drive.mat")
 
 
-def test_more_samples_than_a_reader_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recording = open_here(mat73(tmp_path / "drive.mat", LOG))
-    monkeypatch.setattr("avtorch.io.formats.listed.MOST_CELLS", 299)
-    with pytest.raises(InputError, match="has 300 samples"):
-        recording.read(["log.speed", "log.engaged"])
-
-
 @pytest.mark.parametrize("compressed", [False, True])
 def test_damage_to_version_5_is_read_or_refused(tmp_path: Path, compressed: bool, fresh_seed: int) -> None:
     path = mat5(tmp_path / "drive.mat", LOG, do_compression=compressed)

@@ -132,20 +132,6 @@ def test_only_channels_that_are_asked_for_are_read(tmp_path: Path, monkeypatch: 
     assert recording.read([]) == {}
 
 
-def test_a_channel_that_is_not_there(tmp_path: Path) -> None:
-    recording = open_here(by_another(tmp_path / "drive.mf4"))
-    with pytest.raises(InputError, match=r"drive.mf4: channel 'imu.sped' is missing; channels: chassis.speed, count"):
-        recording.read(["imu.sped"])
-
-
-def test_more_samples_than_a_reader_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recording = open_here(by_another(tmp_path / "drive.mf4"))
-    monkeypatch.setattr("avtorch.io.formats.listed.MOST_CELLS", 399)
-    recording.read(["imu.speed"])
-    with pytest.raises(InputError, match="has 400 samples in the channels that are read; needs 399 at most"):
-        recording.read(["imu.speed", "count_imu"])
-
-
 def blocks(raw: bytes, name: bytes) -> list[int]:
     found, at = [], raw.find(b"##" + name)
     while at >= 0:

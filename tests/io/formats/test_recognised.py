@@ -13,8 +13,6 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.io.formats import is_recording, kinds, open_recording
-from avtorch.io.formats.presets import AUTOWARE, CARLA, OPENPILOT, PRESETS
-from avtorch.io.mapping import SIGNALS
 
 from .survival import refused
 
@@ -110,23 +108,3 @@ def test_looking_at_a_file_loads_no_library(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
-
-
-def test_layouts_speak_of_signals_and_units_that_logs_know() -> None:
-    from avtorch.io.units import to_si
-
-    for preset in PRESETS:
-        assert set(preset.signals) <= {*SIGNALS, "throttle", "brake"}
-        for signal, sources in preset.signals.items():
-            for source in sources:
-                if source.unit and signal not in ("throttle", "brake"):
-                    to_si(signal, source.unit)
-
-
-def test_a_layout_is_found_among_channels() -> None:
-    names = ["/control/command/control_cmd/longitudinal/acceleration", "/vehicle/status/control_mode/mode", "/x"]
-    found = AUTOWARE.find(names)
-    assert {signal: channel for signal, (channel, _) in found.items()} == {"accel_cmd": names[0], "engaged": names[1]}
-    assert found["engaged"][1].when == (1, 3)
-    assert CARLA.find(["/carla/ego_vehicle/vehicle_status/velocity"])["speed"][1].unit == "m/s"
-    assert OPENPILOT.find(names) == {}

@@ -6,13 +6,12 @@ A layout names what its stack calls things; whether a recording has them is seen
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
 from fnmatch import fnmatchcase
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class Source:
+class Source(NamedTuple):
     """Where a signal lies: the name of a channel, in which ``*`` stands for any part, and its unit, "" for none.
 
     Where a number stands for a state, `when` lists those that mean yes, as for `engaged`.
@@ -23,35 +22,14 @@ class Source:
     when: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True)
-class Preset:
-    """The layout of one stack, as messages call it: the places of each signal by its name, such as ``accel_cmd``."""
-
-    words: str
-    signals: Mapping[str, tuple[Source, ...]]
-
-    def find(self, names: Iterable[str]) -> dict[str, tuple[str, Source]]:
-        """For each signal that `names` hold, the channel and where it was expected; the first of several matches."""
-        there = tuple(names)
-        found: dict[str, tuple[str, Source]] = {}
-        for signal, sources in self.signals.items():
-            for source in sources:
-                match = next((name for name in there if fnmatchcase(name, source.channel)), None)
-                if match is not None:
-                    found[signal] = (match, source)
-                    break
-        return found
-
-
-def _preset(words: str, **signals: tuple[Source, ...]) -> Preset:
-    return Preset(words, signals)
+def _layout(**signals: tuple[Source, ...]) -> dict[str, tuple[Source, ...]]:
+    return signals
 
 
 _COMMAND = "/control/command/control_cmd/longitudinal"
 _ACTUATION = "/vehicle/status/actuation_status/status"
 
-AUTOWARE = _preset(
-    "Autoware (ROS 2 bag)",
+_AUTOWARE = _layout(
     # the time of a channel is its message's stamp
     accel_cmd=(Source(f"{_COMMAND}/acceleration", "m/s2"),),
     speed=(Source("/vehicle/status/velocity_status/longitudinal_velocity", "m/s"),),
@@ -62,8 +40,7 @@ AUTOWARE = _preset(
     brake=(Source(f"{_ACTUATION}/brake_status", "1"),),
 )
 
-APOLLO = _preset(
-    "Apollo (cyber record)",
+_APOLLO = _layout(
     time=(Source("/apollo/canbus/chassis/header/timestamp_sec", "s"),),
     accel_cmd=(Source("/apollo/control/acceleration", "m/s2"),),
     speed=(Source("/apollo/canbus/chassis/speed_mps", "m/s"),),
@@ -81,8 +58,7 @@ def _openpilot(*path: str, unit: str = "", when: tuple[int, ...] = ()) -> tuple[
     return Source(".".join(path), unit, when), Source("/" + "/".join(path), unit, when)
 
 
-OPENPILOT = _preset(
-    "openpilot (qlog or rlog, exported)",
+_OPENPILOT = _layout(
     time=(Source("logMonoTime", "ns"),),
     accel_cmd=_openpilot("carControl", "actuators", "accel", unit="m/s2"),
     speed=_openpilot("carState", "vEgo", unit="m/s"),
@@ -93,12 +69,32 @@ OPENPILOT = _preset(
     brake=_openpilot("carState", "brake", unit="1"),
 )
 
-CARLA = _preset(
-    "CARLA (ROS bridge)",
+_CARLA = _layout(
     accel_cmd=(Source("/carla/*/ackermann_cmd/acceleration", "m/s2"),),
     speed=(Source("/carla/*/vehicle_status/velocity", "m/s"), Source("/carla/*/speedometer/data", "m/s")),
     throttle=(Source("/carla/*/vehicle_status/control/throttle", "1"),),
     brake=(Source("/carla/*/vehicle_status/control/brake", "1"),),
 )
 
-PRESETS = (AUTOWARE, APOLLO, OPENPILOT, CARLA)
+LAYOUTS = {
+    "Autoware (ROS 2 bag)": _AUTOWARE,
+    "Apollo (cyber record)": _APOLLO,
+    "openpilot (qlog or rlog, exported)": _OPENPILOT,
+    "CARLA (ROS bridge)": _CARLA,
+}
+"""By what messages call the stack: the places of each signal by its name, such as ``accel_cmd``."""
+
+
+def layout_of(names: Iterable[str]) -> tuple[str | None, dict[str, tuple[str, Source]]]:
+    """The known layout of a log with columns `names`, which has a command and a response, and for each of its signals
+    the column and where it was expected, the first of several matches; nothing otherwise."""
+    there = tuple(names)
+    for words, signals in LAYOUTS.items():
+        found: dict[str, tuple[str, Source]] = {}
+        for signal, sources in signals.items():
+            matches = ((name, source) for source in sources for name in there if fnmatchcase(name, source.channel))
+            if (first := next(matches, None)) is not None:
+                found[signal] = first
+        if "accel_cmd" in found and ("speed" in found or "accel" in found):
+            return words, found
+    return None, {}
