@@ -20,7 +20,7 @@ from numba import njit
 from numpy.fft import irfft, rfft, rfftfreq
 from scipy.ndimage import maximum_filter1d
 
-from avtorch.arrays import FloatArray
+from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.engine.coordinates import INDEX
 from avtorch.gap.engine.drive_data import DriveData, one_pole
 from avtorch.gap.engine.hypothesis import Hypothesis
@@ -83,7 +83,7 @@ def demand_score(h: Hypothesis, covariance: FloatArray, x: FloatArray, *, dead_t
     weights = precision(data, covariance)
     columns = x.reshape(-1, *x.shape[-3:])
     out = np.empty((len(columns), len(data.time)))
-    rows = [[data.adjoint(w) for w in _weighted(weights, column)] for column in columns]
+    rows = [[data.adjoint(w) for w in weighted(weights, column)] for column in columns]
     for i, j in zip(data.bounds[:-1], data.bounds[1:], strict=True):
         n = 1 << int(j - i + data.warm_rows).bit_length()  # room for what the filters pull across an end
         frequency: FloatArray = rfftfreq(n, data.dt).astype(np.float64)
@@ -94,7 +94,7 @@ def demand_score(h: Hypothesis, covariance: FloatArray, x: FloatArray, *, dead_t
     return out.reshape(*x.shape[:-3], -1)
 
 
-def _weighted(weights: FloatArray, x: FloatArray) -> FloatArray:
+def weighted(weights: FloatArray, x: FloatArray) -> FloatArray:
     """S^-1 x, (channel, frame, bin)."""
     return np.array([sum(weights[:, i, j] * x[j] for j in range(len(x))) for i in range(len(x))])
 
@@ -121,9 +121,9 @@ def information_of_coefficients(
     (column,) for a `residual` (channel, frame, bin), in the bands that count here."""
     weights = precision(data, covariance)
     used = int(np.count_nonzero(weights[:, 0, 0]))
-    weighted = np.array([_weighted(weights[:used], c[..., :used]).ravel() for c in columns])
+    in_noise = np.array([weighted(weights[:used], c[..., :used]).ravel() for c in columns])
     flat = columns[..., :used].reshape(len(columns), -1)
-    return flat @ weighted.T, weighted @ residual[..., :used].ravel()
+    return flat @ in_noise.T, in_noise @ residual[..., :used].ravel()
 
 
 def frame_cover(h: Hypothesis) -> FloatArray:
@@ -152,19 +152,32 @@ def response_rows(h: Hypothesis) -> int:
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def take_out(
-    score: FloatArray, information: FloatArray, cover: FloatArray, pulse: FloatArray, first: int, sign: float
+    score: FloatArray, information: FloatArray, cover: FloatArray, rows: IntArray, pulse: FloatArray, sign: float
 ) -> None:
-    """`score` -= sign D A D w for a `pulse` w that begins in row `first`: the score beside that pulse, in place.
-
-    `information` (lag,), `cover` (row,).
-    """
+    """`score` -= sign D A D w for a change w that is a `pulse` (element,) in `rows` (element,): the score beside it, in
+    place. `information` (lag,), `cover` (row,)."""
     n, reach = len(score), len(information)
-    for k in range(len(pulse)):
-        at = first + k
-        if pulse[k] == 0.0 or at >= n:
+    for k in range(len(rows)):
+        at = rows[k]
+        if pulse[k] == 0.0:
             continue
         w = sign * pulse[k] * cover[at]
         for i in range(max(0, at - reach + 1), at):
             score[i] -= w * cover[i] * information[at - i]
         for i in range(at, min(n, at + reach)):
             score[i] -= w * cover[i] * information[i - at]
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def pulse_energy(information: FloatArray, cover: FloatArray, rows: IntArray, pulse: FloatArray) -> float:
+    """w' D A D w of such a change, whose `rows` (element,) are in order of time, but for pulses that overlap."""
+    total, reach = 0.0, len(information)
+    for k in range(len(rows)):
+        w = pulse[k] * cover[rows[k]]
+        total += w * w * information[0]
+        for j in range(k + 1, len(rows)):
+            lag = rows[j] - rows[k]
+            if lag >= reach:
+                break
+            total += 2.0 * w * pulse[j] * cover[rows[j]] * information[abs(lag)]
+    return total

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -30,6 +31,7 @@ from avtorch.gap.engine.demand_filter import (
     demand_score,
     frame_cover,
     information_of_coefficients,
+    pulse_energy,
     take_out,
 )
 from avtorch.gap.engine.drive_data import DriveData
@@ -224,14 +226,13 @@ def _apart(levels: FloatArray, others: FloatArray) -> BoolArray:
 
 
 # interruptions as pulses of the demand -------------------------------------------------------------------------------
-@dataclass(frozen=True, eq=False)
-class _Pulses:
-    """Interruptions p of full depth: `first` (upshift,) rows and `values` (upshift, row) [m/s²], 0 behind their end.
+class _Pulses(NamedTuple):
+    """Interruptions p of full depth: `values` (element,) [m/s²] in `rows` (element,).
 
     `size` is p' A~ p of all together, and `others` N^-1 Z p (parameter,) what the other parameters take of them.
     """
 
-    first: IntArray
+    rows: IntArray
     values: FloatArray
     size: float
     others: FloatArray
@@ -283,20 +284,19 @@ class _PulseLikelihood:
         """Of upshifts at `times` (upshift,) [s]; the plant's interruption begins a step of its grid later."""
         data = self.data
         begins = times + data.dt / (int(data.dt / GRID_S) + 1)
-        first = np.searchsorted(data.time, begins, side="right") - 1
-        values = _pulses(data.time, data.starts, self.demand, begins, first, duration)
-        across = _dots(self.columns, first, values)
+        rows, values = _pulses(data.time, data.starts, self.demand, begins, duration)
+        across = self.columns[:, rows] @ values
         taken = self.inverse @ across
-        size = _energy(first, values, self.information, self.cover) - float(across @ taken)
-        return _Pulses(first, values, size, taken)
+        size = pulse_energy(self.information, self.cover, rows, values) - float(across @ taken)
+        return _Pulses(rows, values, size, taken)
 
     def gain(self, score: FloatArray, pulses: _Pulses) -> float:
         """-score' p [nats per depth]."""
-        return -float(_dots(score[None], pulses.first, pulses.values)[0])
+        return -float(score[pulses.rows] @ pulses.values)
 
     def take_out(self, score: FloatArray, pulses: _Pulses, depth: float) -> None:
         """`score` beside pulses of that depth (negative: without them), in place."""
-        _take_out_all(score, self.information, self.cover, pulses.first, pulses.values, -depth)
+        take_out(score, self.information, self.cover, pulses.rows, pulses.values, -depth)
         score -= depth * (pulses.others @ self.columns)
 
 
@@ -418,73 +418,18 @@ def dips_below(speed: FloatArray, starts: BoolArray, level: float) -> FloatArray
 
 @njit(cache=True, error_model="numpy")
 def _pulses(
-    time: FloatArray, starts: BoolArray, demand: FloatArray, begins: FloatArray, first: IntArray, duration: float
-) -> FloatArray:
-    """The lost demand (upshift, row) from `first` rows (upshift,) on: `demand` times the share of each step that lies
-    within `duration` of `begins`. None reaches into another stretch."""
-    n = len(time)
-    most = 1
+    time: FloatArray, starts: BoolArray, demand: FloatArray, begins: FloatArray, duration: float
+) -> tuple[IntArray, FloatArray]:
+    """The lost demand (element,) and its rows: `demand` times the share of each step that lies within `duration` of
+    `begins` (upshift,). None reaches into another stretch."""
+    first, last = np.searchsorted(time, begins, side="right") - 1, np.searchsorted(time, begins + duration)
+    rows, values = np.empty((last - first).sum(), np.int64), np.empty((last - first).sum())
+    count = 0
     for e in range(len(begins)):
-        k = first[e]
-        while k < n - 1 and time[k] < begins[e] + duration:
-            k += 1
-        most = max(most, k - first[e])
-    values = np.zeros((len(begins), most))
-    for e in range(len(begins)):
-        for j in range(most):
-            k = first[e] + j
-            if k >= n - 1 or starts[k + 1]:
+        for k in range(first[e], min(last[e], len(time) - 1)):
+            if starts[k + 1]:
                 break
-            h = time[k + 1] - time[k]
-            share = (min(time[k + 1], begins[e] + duration) - max(time[k], begins[e])) / h
-            if share <= 0.0:
-                break
-            values[e, j] = demand[k] * share
-    return values
-
-
-@njit(cache=True, fastmath=True, error_model="numpy")
-def _dots(rows: FloatArray, first: IntArray, values: FloatArray) -> FloatArray:
-    """Inner products (signal,) of signals `rows` (signal, row) with all pulses."""
-    out = np.zeros(len(rows))
-    n = rows.shape[1]
-    for e in range(len(first)):
-        for j in range(min(values.shape[1], n - first[e])):
-            if values[e, j] != 0.0:
-                for s in range(len(rows)):
-                    out[s] += rows[s, first[e] + j] * values[e, j]
-    return out
-
-
-@njit(cache=True, fastmath=True, error_model="numpy")
-def _energy(first: IntArray, values: FloatArray, information: FloatArray, cover: FloatArray) -> float:
-    """p' D A D p of all pulses together, which are in order of time."""
-    reach, rows = len(information), values.shape[1]
-    seen = values.copy()
-    for e in range(len(first)):
-        for j in range(rows):
-            seen[e, j] *= cover[min(first[e] + j, len(cover) - 1)]
-    total = 0.0
-    for e in range(len(first)):
-        for f in range(e, len(first)):
-            apart = first[f] - first[e]
-            if apart - rows >= reach:
-                break
-            both = 0.0
-            for i in range(rows):
-                if seen[e, i] != 0.0:
-                    for j in range(rows):
-                        lag = abs(apart + j - i)
-                        if lag < reach:
-                            both += seen[e, i] * seen[f, j] * information[lag]
-            total += both if e == f else 2.0 * both
-    return float(total)
-
-
-@njit(cache=True, error_model="numpy")
-def _take_out_all(
-    score: FloatArray, information: FloatArray, cover: FloatArray, first: IntArray, values: FloatArray, sign: float
-) -> None:
-    """`take_out` of all pulses."""
-    for e in range(len(first)):
-        take_out(score, information, cover, values[e], first[e], sign)
+            lost = min(time[k + 1], begins[e] + duration) - max(time[k], begins[e])
+            rows[count], values[count] = k, demand[k] * lost / (time[k + 1] - time[k])
+            count += 1
+    return rows[:count], values[:count]

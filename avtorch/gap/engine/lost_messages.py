@@ -28,6 +28,7 @@ from avtorch.gap.engine.demand_filter import (
     demand_information,
     demand_score,
     frame_cover,
+    pulse_energy,
     response_rows,
     take_out,
 )
@@ -137,14 +138,11 @@ def best_stretches(m: PulseModel, score: FloatArray) -> list[tuple[int, int]]:
 
 def gain_of(m: PulseModel, score: FloatArray, rows: Sequence[tuple[int, int]]) -> float:
     """G of a set of disjoint stretches [nats]."""
-    beside, linear = score.copy(), 0.0
-    for i, j in rows:
-        pulse = m.demand[i - 1] - m.demand[i:j]
-        linear += float(pulse @ score[i:j])
-        take_out(beside, m.information, m.cover, pulse, i, 1.0)
-    # s' w - w' A w / 2 = (s' w + (s - A w)' w) / 2
-    left = sum(float((m.demand[i - 1] - m.demand[i:j]) @ beside[i:j]) for i, j in rows)
-    return 0.5 * (linear + left) - m.penalty * len(rows)
+    if not rows:
+        return 0.0
+    at = np.concatenate([np.arange(i, j) for i, j in rows])
+    w = np.concatenate([m.demand[i - 1] - m.demand[i:j] for i, j in rows])
+    return float(score[at] @ w) - 0.5 * pulse_energy(m.information, m.cover, at, w) - m.penalty * len(rows)
 
 
 def schedule(first: IntArray, stop: IntArray, value: FloatArray, apart: int) -> IntArray:
@@ -255,10 +253,8 @@ def _best_within(m: PulseModel, score: FloatArray, begin: int, end: int) -> tupl
 @njit(cache=True, error_model="numpy")
 def _put(m: PulseModel, score: FloatArray, i: int, j: int, sign: float) -> None:
     """`score` beside the stretch from row `i` to `j` - 1 (`sign` -1: without it), in place."""
-    pulse = np.empty(j - i)
-    for k in range(i, j):
-        pulse[k - i] = m.demand[i - 1] - m.demand[k]
-    take_out(score, m.information, m.cover, pulse, i, sign)
+    rows = np.arange(i, j)
+    take_out(score, m.information, m.cover, rows, m.demand[i - 1] - m.demand[rows], sign)
 
 
 @njit(cache=True, error_model="numpy")

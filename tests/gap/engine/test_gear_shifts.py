@@ -61,9 +61,7 @@ def test_interruptions_are_those_of_the_effect(fresh_seed: int) -> None:
     level, rearm, duration = 5.1, float(rng.uniform(0.2, 1.2)), float(rng.uniform(0.1, 0.6))
     pulses = likelihood.pulses(likelihood.upshifts(level, rearm), duration)
     lost = np.zeros(len(data.time))
-    for first, values in zip(pulses.first, pulses.values, strict=True):
-        rows = slice(first, min(first + len(values), len(lost)))
-        lost[rows] = np.maximum(lost[rows], values[: rows.stop - first])
+    np.maximum.at(lost, pulses.rows, pulses.values)
     effect = GearShift(1.0, duration, speeds=(level,), rearm_mps=rearm)
     steps = torch.as_tensor(np.diff(data.time, append=data.time[-1] + 0.01))
     one = torch.ones(1, dtype=torch.float64)
