@@ -125,11 +125,7 @@ _PANELS = {
 SHOWN_S = 20.0
 """From when on the strategies' drives are drawn [s]."""
 
-_KINDS = {
-    "upper": "as printed, upper level only",
-    "with": "as printed, with the lower level",
-    "ours": "our strategist",
-}
+_KINDS = {"upper": "as printed, upper level only", "with": "as printed, with the lower level", "ours": "our strategist"}
 
 
 def paper_pictures(found: Mapping[str, Any]) -> dict[str, Callable[[], Figure]]:

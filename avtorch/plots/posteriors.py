@@ -466,12 +466,7 @@ def _wide(names: tuple[str, ...]) -> float:
 
 
 def _panels(
-    rows: int,
-    columns: int,
-    panel: tuple[float, float],
-    *,
-    beside: float = 0.3,
-    sharey: Literal["row"] | bool = False,
+    rows: int, columns: int, panel: tuple[float, float], *, beside: float = 0.3, sharey: Literal["row"] | bool = False
 ) -> tuple[Figure, np.ndarray]:
     """A figure and its axes (row, column), each of a `panel`'s width and height [in]."""
     wide, high = panel

@@ -51,12 +51,7 @@ def motion(ax: Axes, time: ArrayLike, traces: Mapping[str, ArrayLike], *, quanti
 
 
 def belief_band(
-    ax: Axes,
-    windows: Windows,
-    name: str,
-    *,
-    truth: Steps | None = None,
-    bounds: tuple[float, float] | None = None,
+    ax: Axes, windows: Windows, name: str, *, truth: Steps | None = None, bounds: tuple[float, float] | None = None
 ) -> Axes:
     """The belief about one parameter: 90 % interval and mean of each window, paler where the window was not used.
 

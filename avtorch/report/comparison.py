@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from avtorch.gap.quantity import Quantity, unit_behind, words_of
+from avtorch.gap.result.comparison import ChangeCause, Comparison, detectable_text
+from avtorch.gap.result.log_facts import LogFacts
 from avtorch.report.page import Origin, Page, Picture, Section, Tone, picture_of
 from avtorch.report.table import Table
 
 if TYPE_CHECKING:
     from avtorch.external import SimulatorComparison
-    from avtorch.gap.result.comparison import ChangeCause, Comparison
-    from avtorch.gap.result.log_facts import LogFacts
 
 _ROWS = {
     "T_L": "lag T_L [s]",
@@ -36,16 +36,12 @@ def comparison_html(
     found: Comparison | SimulatorComparison, *, notes: Sequence[str] = (), origin: Origin | None = None
 ) -> str:
     """The page of a comparison as text; `notes`: on the data."""
-    from avtorch.gap.result.comparison import Comparison
-
     page = _of_drives(found, notes) if isinstance(found, Comparison) else _of_simulators(found, notes)
     return page.html(origin)
 
 
 def comparison_tables(found: Comparison | SimulatorComparison) -> tuple[Table, Table]:
     """The errors before and after, or of the first and the second; and what has changed or differs, as far as known."""
-    from avtorch.gap.result.comparison import Comparison
-
     if isinstance(found, Comparison):
         moved = {**found.car, **found.gap}
         rows = [
@@ -72,8 +68,6 @@ def comparison_tables(found: Comparison | SimulatorComparison) -> tuple[Table, T
 
 def _cause_table(cause: ChangeCause | None) -> Table:
     """Parts of the change, or the least changes that would show."""
-    from avtorch.gap.result.comparison import detectable_text
-
     if cause is None or not cause.parts:
         least = () if cause is None else tuple((name, detectable_text(name, x)) for name, x in cause.detectable.items())
         return Table("What would show", ("least change that would show", "size"), least)

@@ -18,12 +18,7 @@ from avtorch.report.table import Table
 from avtorch.results import MEASURES
 from avtorch.vehicle import stability
 
-_STRATEGIES = {
-    1: "the lower level",
-    2: "the time gap",
-    3: "the gains",
-    4: "the leader's acceleration fed forward",
-}
+_STRATEGIES = {1: "the lower level", 2: "the time gap", 3: "the gains", 4: "the leader's acceleration fed forward"}
 _MOST = 40  # rows of the story
 _DOTS, _POINTS = 150, 301  # draws of a cloud, points of a map's axis: more would make a page of megabytes
 
@@ -148,9 +143,7 @@ def _number(value: float | None) -> str:
 def story_table(answer: Mapping[str, Any]) -> Table:
     """The change, alerts and actions in order, the first of them."""
     change = answer["change"]
-    lines = [
-        (change["time_s"], "change", f"the vehicle changes to T_L {change['T_L']:g} s, K_L {change['K_L']:g}"),
-    ]
+    lines = [(change["time_s"], "change", f"the vehicle changes to T_L {change['T_L']:g} s, K_L {change['K_L']:g}")]
     for a, more in begun(answer):
         again = f" (and in {more} more window{'s' * (more > 1)})" if more else ""
         lines.append((a["time_s"], "alert", f"{a['detector']}: {a['why']}{again}"))
