@@ -28,7 +28,7 @@ def stat(mean: float, half: float) -> dict[str, float]:
 
 
 def window(start: float, *, lag: float = 0.3, excited: bool = True, p: float = 1.0) -> dict:
-    ends = {"start_s": start, "end_s": start + 2.0, "n": 200, "excited": excited, "alerts": []}
+    ends = {"start_s": start, "end_s": start + 2.0, "n": 200, "excited": excited, "used": excited, "alerts": []}
     return {**ends, "T_L": stat(lag, 0.05), "K_L": stat(1.0, 0.1), "p_string_stable": p}
 
 
@@ -59,10 +59,15 @@ def log() -> Log:
     return Log.from_arrays(time=time, accel_cmd=np.sin(time), speed=speed, engaged=engaged)
 
 
+def mean_of(ax: Axes) -> tuple[np.ndarray, np.ndarray]:
+    """The line of the mean."""
+    mean = next(line for line in ax.lines if line.get_label() == "mean")
+    return np.asarray(mean.get_xdata(), float), np.asarray(mean.get_ydata(), float)
+
+
 def test_band_shows_interval_and_breaks_where_not_excited() -> None:
     ax = belief_band(axes(), WINDOWS, "T_L")
-    mean = next(line for line in ax.lines if line.get_label() == "mean")
-    x, y = np.asarray(mean.get_xdata(), float), np.asarray(mean.get_ydata(), float)
+    x, y = mean_of(ax)
     assert np.isnan(y[(x > 2.0) & (x < 4.0)]).all()
     assert set(y[~np.isnan(y)]) == {0.3, 1.5}
     low, high = ax.get_ylim()
@@ -71,9 +76,7 @@ def test_band_shows_interval_and_breaks_where_not_excited() -> None:
 
 
 def test_band_breaks_across_a_gap() -> None:
-    ax = belief_band(axes(), [window(0.0), window(10.0)], "T_L")
-    mean = next(line for line in ax.lines if line.get_label() == "mean")
-    y = np.asarray(mean.get_ydata(), float)
+    _, y = mean_of(belief_band(axes(), [window(0.0), window(10.0)], "T_L"))
     assert np.isnan(y).sum() == 1
 
 
@@ -123,7 +126,8 @@ def test_the_legend_names_what_is_drawn() -> None:
 
 def test_labels_of_lines_are_not_cut_off() -> None:
     figure = Figure(figsize=(4, 4), dpi=100)
-    ax = setting_region(figure.subplots(), SETTING, T_range=(0.02, 2.2), K_range=(0.25, 1.3), points=101)
+    ranges = {"T_range": (0.02, 2.2), "K_range": (0.25, 1.3)}
+    ax = setting_region(figure.subplots(), SETTING, **ranges, clouds={}, truth=None, points=101)
     figure.canvas.draw()
     frame = ax.get_window_extent()
     labels = [text.get_window_extent() for text in ax.texts]
@@ -152,8 +156,9 @@ def test_a_probability_is_drawn_from_when_it_is_known() -> None:
 def test_setting_region_is_that_of_the_effective_vehicle() -> None:
     # with the lower level's model right at (1.5, 0.5) that vehicle behaves as the target and is string stable
     right = {**SETTING, "T_hat": 1.5, "K_hat": 0.5}
+    ranges = {"T_range": (1.4, 1.6), "K_range": (0.45, 0.55)}
     for setting, expected in ((SETTING, AMPLIFIES), (right, STABLE)):
-        ax = setting_region(axes(), setting, T_range=(1.4, 1.6), K_range=(0.45, 0.55), points=3)
+        ax = setting_region(axes(), setting, **ranges, clouds={}, truth=None, points=3)
         assert verdict_at(ax, 1.5, 0.5) == expected
 
 
@@ -230,26 +235,24 @@ def test_save_refuses_a_folder(tmp_path: Path) -> None:
 
 def test_an_excited_window_that_did_not_settle_is_drawn_as_carried_over() -> None:
     lost = {**window(2.0), "used": False}
-    ax = belief_band(axes(), [{**window(0.0), "used": True}, lost], "T_L")
-    mean = next(line for line in ax.lines if line.get_label() == "mean")
-    x, y = np.asarray(mean.get_xdata(), float), np.asarray(mean.get_ydata(), float)
+    x, y = mean_of(belief_band(axes(), [window(0.0), lost], "T_L"))
     assert np.isnan(y[x > 2.0]).all()
 
 
-def test_an_alarm_that_goes_on_is_marked_where_it_begins_and_where_it_is_acted_upon() -> None:
-    windows = [{**window(t), "alerts": ["stability"]} for t in (0.0, 2.0, 4.0)]
-    alerts = [{"time_s": w["end_s"], "detector": "stability", "why": "x"} for w in windows]
-    actions = [{"time_s": 6.0, "strategies": [1], "settings": SETTING}]
-    figure = plots.probability_figure({"windows": windows, "alerts": alerts, "actions": actions})
-    wide = [line for line in figure.axes[0].lines if line.get_linewidth() == 5]
-    assert [line.get_xdata()[0] for line in wide] == [2.0, 6.0]
-
-
-def test_a_second_detector_is_marked_while_the_first_goes_on() -> None:
-    windows = [{**window(t), "alerts": ["accepted_change"]} for t in (0.0, 2.0, 4.0)]
-    windows[2]["alerts"] = ["stability", "accepted_change"]
+@pytest.mark.parametrize(
+    ("raised", "acted"),
+    [
+        ([["stability"]] * 3, [6.0]),  # it goes on until it is acted upon
+        ([["accepted_change"], ["accepted_change"], ["stability", "accepted_change"]], []),  # a second one begins
+    ],
+)
+def test_an_alarm_is_marked_where_it_begins_and_where_it_is_acted_upon(
+    raised: list[list[str]], acted: list[float]
+) -> None:
+    windows = [{**window(t), "alerts": names} for t, names in zip((0.0, 2.0, 4.0), raised, strict=True)]
     alerts = [{"time_s": w["end_s"], "detector": name, "why": "x"} for w in windows for name in w["alerts"]]
-    figure = plots.probability_figure({"windows": windows, "alerts": alerts})
+    actions = [{"time_s": time, "strategies": [1], "settings": SETTING} for time in acted]
+    figure = plots.probability_figure({"windows": windows, "alerts": alerts, "actions": actions})
     wide = [line for line in figure.axes[0].lines if line.get_linewidth() == 5]
     assert [line.get_xdata()[0] for line in wide] == [2.0, 6.0]
 
