@@ -20,16 +20,16 @@ _ROWS = {
     "rollout_rmse_accel": "acceleration error, {horizon} s [m/s²]",
     "rollout_rmse_speed": "speed error, {horizon} s [m/s]",
 }
-_OF_SIMULATOR: Mapping[str, tuple[str, Tone]] = {
-    "closer": ("the simulator is closer to the car after", "green"),
-    "farther": ("the simulator is farther from the car after", "amber"),
-    "inconclusive": ("whether the simulator is closer cannot be told", "blue"),
+_OF_SIMULATOR: Mapping[str, tuple[str, str, Tone]] = {
+    "closer": ("the simulator is closer to the car after", "The simulator after is closer to the car", "green"),
+    "farther": ("the simulator is farther from the car after", "The simulator after is farther from the car", "amber"),
+    "inconclusive": (
+        "whether the simulator is closer cannot be told",
+        "Which simulator is closer to the car cannot be told",
+        "blue",
+    ),
 }
-_ONE_DRIVE = {
-    "closer": "The simulator after is closer to the car",
-    "farther": "The simulator after is farther from the car",
-    "inconclusive": "Which simulator is closer to the car cannot be told",
-}
+"""What is said of two drives, and of two simulators of one drive."""
 
 
 def comparison_html(
@@ -88,7 +88,7 @@ def _cause_table(cause: ChangeCause | None) -> Table:
 
 # two sets of drives ------------------------------------------------------------------------------------------------
 def _of_drives(found: Comparison, notes: Sequence[str]) -> Page:
-    said, tone = _OF_SIMULATOR[found.simulator]
+    said, of_one_drive, tone = _OF_SIMULATOR[found.simulator]
     one_drive = found.before == found.after
     car = "The car has changed" if found.changed else "No change of T_L and K_L is detected"
     table, parts = comparison_tables(found)
@@ -99,7 +99,7 @@ def _of_drives(found: Comparison, notes: Sequence[str]) -> Page:
         "Comparison",
         _facts(found.before) if one_drive else f"before: {_facts(found.before)}; after: {_facts(found.after)}",
         Section(
-            _ONE_DRIVE[found.simulator] if one_drive else f"{car}; {said}",
+            of_one_drive if one_drive else f"{car}; {said}",
             (found.why,),
             (_ratios("after / before", ratios, table, none),),
         ),

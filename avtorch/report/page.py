@@ -89,10 +89,8 @@ _COLOURS = {
     "#fbe6c4": "p-amplifies",
     "#ddd3d8": "p-unstable",
     "#b07a1e": "p-contour",
-    "#dcdcdc": "p-fill",
     "#bbbbbb": "p-bar",
     "#dddddd": "p-fill",
-    "#d5d5d5": "p-fill",  # a band of ranks
     "#dadada": "p-fill",  # an exact density
     "#555555": "soft",  # its outline
     "#e6e6e6": "p-grid",
