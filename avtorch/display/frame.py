@@ -163,14 +163,14 @@ class Card:
 
     def __str__(self) -> str:
         """As a console shows it."""
-        table = [] if self.table is None or not len(self.table) else self.table.lines(self.most)
+        table = self.table.lines(self.most) if self.table else []
         sentences = (printable(line, _SENTENCE) for line in (self.title, *self.lines))
         return "\n".join([*(part for line in sentences for part in wrap(line, WIDTH)), *table])
 
     def html(self) -> str:
         """As a notebook shows it; every text escaped."""
         lines = "".join(f"<div>{escape(printable(line, _SENTENCE))}</div>" for line in self.lines)
-        table = "" if self.table is None or not len(self.table) else self.table.html(self.most)
+        table = self.table.html(self.most) if self.table else ""
         return f"<div><strong>{escape(printable(self.title, _SENTENCE))}</strong>{lines}{table}</div>"
 
 
