@@ -28,7 +28,7 @@ def stat(mean: float, half: float) -> dict[str, float]:
 
 
 def window(start: float, *, lag: float = 0.3, excited: bool = True, p: float = 1.0) -> dict:
-    ends = {"start_s": start, "end_s": start + 2.0, "n": 200, "excited": excited, "alerts": []}
+    ends = {"start_s": start, "end_s": start + 2.0, "n": 200, "excited": excited, "used": excited, "alerts": []}
     return {**ends, "T_L": stat(lag, 0.05), "K_L": stat(1.0, 0.1), "p_string_stable": p}
 
 
@@ -59,24 +59,25 @@ def log() -> Log:
     return Log.from_arrays(time=time, accel_cmd=np.sin(time), speed=speed, engaged=engaged)
 
 
-def mean_of(windows: list[dict]) -> tuple[np.ndarray, np.ndarray, Axes]:
-    """The line of the mean, and the axes."""
-    ax = belief_band(axes(), windows, "T_L")
+def mean_of(ax: Axes) -> tuple[np.ndarray, np.ndarray]:
+    """The line of the mean."""
     mean = next(line for line in ax.lines if line.get_label() == "mean")
-    return np.asarray(mean.get_xdata(), float), np.asarray(mean.get_ydata(), float), ax
+    return np.asarray(mean.get_xdata(), float), np.asarray(mean.get_ydata(), float)
 
 
 def test_band_shows_interval_and_breaks_where_not_excited() -> None:
-    x, y, ax = mean_of(WINDOWS)
+    ax = belief_band(axes(), WINDOWS, "T_L")
+    x, y = mean_of(ax)
     assert np.isnan(y[(x > 2.0) & (x < 4.0)]).all()
     assert set(y[~np.isnan(y)]) == {0.3, 1.5}
     low, high = ax.get_ylim()
     assert low < 0.25
     assert high > 1.55
-    # across a gap, too; and an excited window that did not settle is drawn as carried over
-    assert np.isnan(mean_of([window(0.0), window(10.0)])[1]).sum() == 1
-    x, y, _ = mean_of([{**window(0.0), "used": True}, {**window(2.0), "used": False}])
-    assert np.isnan(y[x > 2.0]).all()
+
+
+def test_band_breaks_across_a_gap() -> None:
+    _, y = mean_of(belief_band(axes(), [window(0.0), window(10.0)], "T_L"))
+    assert np.isnan(y).sum() == 1
 
 
 def test_a_broad_first_prior_does_not_squeeze_the_rest() -> None:
@@ -118,7 +119,8 @@ def test_the_legend_names_what_is_drawn() -> None:
 
 def test_labels_of_lines_are_not_cut_off() -> None:
     figure = Figure(figsize=(4, 4), dpi=100)
-    ax = setting_region(figure.subplots(), SETTING, T_range=(0.02, 2.2), K_range=(0.25, 1.3), points=101)
+    ranges = {"T_range": (0.02, 2.2), "K_range": (0.25, 1.3)}
+    ax = setting_region(figure.subplots(), SETTING, **ranges, clouds={}, truth=None, points=101)
     figure.canvas.draw()
     frame = ax.get_window_extent()
     labels = [text.get_window_extent() for text in ax.texts]
@@ -147,8 +149,9 @@ def test_a_probability_is_drawn_from_when_it_is_known() -> None:
 def test_setting_region_is_that_of_the_effective_vehicle() -> None:
     # with the lower level's model right at (1.5, 0.5) that vehicle behaves as the target and is string stable
     right = {**SETTING, "T_hat": 1.5, "K_hat": 0.5}
+    ranges = {"T_range": (1.4, 1.6), "K_range": (0.45, 0.55)}
     for setting, expected in ((SETTING, AMPLIFIES), (right, STABLE)):
-        ax = setting_region(axes(), setting, T_range=(1.4, 1.6), K_range=(0.45, 0.55), points=3)
+        ax = setting_region(axes(), setting, **ranges, clouds={}, truth=None, points=3)
         assert verdict_at(ax, 1.5, 0.5) == expected
 
 
@@ -223,24 +226,31 @@ def test_save_refuses_a_folder(tmp_path: Path) -> None:
         plots.save(Figure(), tmp_path)
 
 
+def test_an_excited_window_that_did_not_settle_is_drawn_as_carried_over() -> None:
+    lost = {**window(2.0), "used": False}
+    x, y = mean_of(belief_band(axes(), [window(0.0), lost], "T_L"))
+    assert np.isnan(y[x > 2.0]).all()
+
+
+@pytest.mark.parametrize(
+    ("raised", "acted"),
+    [
+        ([["stability"]] * 3, [6.0]),  # it goes on until it is acted upon
+        ([["accepted_change"], ["accepted_change"], ["stability", "accepted_change"]], []),  # a second one begins
+    ],
+)
+def test_an_alarm_is_marked_where_it_begins_and_where_it_is_acted_upon(
+    raised: list[list[str]], acted: list[float]
+) -> None:
+    windows = [{**window(t), "alerts": names} for t, names in zip((0.0, 2.0, 4.0), raised, strict=True)]
+    alerts = [{"time_s": w["end_s"], "detector": name, "why": "x"} for w in windows for name in w["alerts"]]
+    actions = [{"time_s": time, "strategies": [1], "settings": SETTING} for time in acted]
+    figure = plots.probability_figure({"windows": windows, "alerts": alerts, "actions": actions})
+    wide = [line for line in figure.axes[0].lines if line.get_linewidth() == 5]
+    assert [line.get_xdata()[0] for line in wide] == [2.0, 6.0]
+
+
 def test_a_collision_is_named_in_the_spacing() -> None:
     for spacing, told in ((np.linspace(5.0, -3.0, len(TIME)), 1), (np.full_like(TIME, 5.0), 0)):
         ax = motion(axes(), TIME, {"without action": spacing}, quantity="spacing")
         assert [t.get_text() for t in ax.texts] == ["below 0: collision"] * told
-
-
-@pytest.mark.parametrize(
-    ("alerts", "acted"),
-    [
-        ((["stability"], ["stability"], ["stability"]), True),  # where it begins and where it is acted upon
-        # a second detector while the first goes on
-        ((["accepted_change"], ["accepted_change"], ["stability", "accepted_change"]), False),
-    ],
-)
-def test_alarms_are_marked(alerts: tuple[list[str], ...], acted: bool) -> None:
-    windows = [{**window(t), "alerts": names} for t, names in zip((0.0, 2.0, 4.0), alerts, strict=True)]
-    told = [{"time_s": w["end_s"], "detector": name, "why": "x"} for w in windows for name in w["alerts"]]
-    actions = [{"time_s": 6.0, "strategies": [1], "settings": SETTING}] if acted else []
-    figure = plots.probability_figure({"windows": windows, "alerts": told, "actions": actions})
-    wide = [line for line in figure.axes[0].lines if line.get_linewidth() == 5]
-    assert [line.get_xdata()[0] for line in wide] == [2.0, 6.0]

@@ -10,8 +10,7 @@ Example:
     '<div>'
 """
 
-from avtorch.display.frame import Card, Displayed, Frame
-from avtorch.display.notebook import show
+from avtorch.display.frame import Card, Displayed, Frame, show
 from avtorch.display.progress import progress_bar
 
 __all__ = ["Card", "Displayed", "Frame", "progress_bar", "show"]

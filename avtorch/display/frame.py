@@ -1,11 +1,15 @@
-"""An answer in a few lines, and its small table: drawn as text and as HTML, and handed on as a data frame."""
+"""An answer in a few lines, and its small table: drawn as text and as HTML, shown in a console or a notebook, and
+handed on as a data frame."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from importlib import import_module
 from textwrap import wrap
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -97,18 +101,17 @@ class Frame:
     def html(self, most: int = SHOWN) -> str:
         """The same table as HTML without any style of its own; every text escaped."""
         shown, right = self._drawn(most)
+        sides = ["right" if number else "left" for number in right]
 
         def row(tag: str, cells: Sequence[str]) -> str:
-            sides = (' style="text-align:right"' if number else ' style="text-align:left"' for number in right)
-            return (
-                "<tr>" + "".join(f"<{tag}{s}>{escape(c)}</{tag}>" for s, c in zip(sides, cells, strict=True)) + "</tr>"
-            )
+            pairs = zip(sides, cells, strict=True)
+            drawn = (f'<{tag} style="text-align:{side}">{escape(cell)}</{tag}>' for side, cell in pairs)
+            return f"<tr>{''.join(drawn)}</tr>"
 
         head, *body = zip(*shown, strict=True) if shown else [()]
+        rows = "".join(row("td", cells) for cells in body)
         rest = "".join(f"<div>{escape(line)}</div>" for line in self._rest(most))
-        return (
-            f"<table><thead>{row('th', head)}</thead><tbody>{''.join(row('td', x) for x in body)}</tbody></table>{rest}"
-        )
+        return f"<table><thead>{row('th', head)}</thead><tbody>{rows}</tbody></table>{rest}"
 
     def _drawn(self, most: int) -> tuple[list[list[str]], list[bool]]:
         """Each column with its title in front, and whether it is set to the right."""
@@ -160,14 +163,14 @@ class Card:
 
     def __str__(self) -> str:
         """As a console shows it."""
-        table = [] if self.table is None or not len(self.table) else self.table.lines(self.most)
+        table = self.table.lines(self.most) if self.table else []
         sentences = (printable(line, _SENTENCE) for line in (self.title, *self.lines))
         return "\n".join([*(part for line in sentences for part in wrap(line, WIDTH)), *table])
 
     def html(self) -> str:
         """As a notebook shows it; every text escaped."""
         lines = "".join(f"<div>{escape(printable(line, _SENTENCE))}</div>" for line in self.lines)
-        table = "" if self.table is None or not len(self.table) else self.table.html(self.most)
+        table = self.table.html(self.most) if self.table else ""
         return f"<div><strong>{escape(printable(self.title, _SENTENCE))}</strong>{lines}{table}</div>"
 
 
@@ -183,3 +186,28 @@ class Displayed:
 
     def _repr_html_(self) -> str:
         return self.overview().html()
+
+
+def notebook_display() -> ModuleType | None:
+    """`IPython.display` where a notebook's kernel runs this program; None elsewhere."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    # the shell of a terminal has no kernel and shows neither pictures nor HTML
+    return import_module("IPython.display") if hasattr(shell, "kernel") else None
+
+
+def show(*answers: object) -> None:
+    """Display answers below the cell in a notebook, as its last line would; elsewhere print them.
+
+    Example:
+        >>> from avtorch import Leader, simulate
+        >>> from avtorch.display import show
+        >>> log = simulate(Leader.default(start=30.0, duration=60.0, dt=0.05)).log()
+        >>> show(log.overview().title)  # of the log itself a notebook shows a small table
+        Log arrays: 1200 rows, 59.95 s at 20 Hz, 1 segment
+    """
+    display = notebook_display()
+    for answer in answers:
+        if display is None:
+            print(answer if isinstance(answer, str) else repr(answer))
+        else:
+            display.display(answer)

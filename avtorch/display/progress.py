@@ -19,7 +19,7 @@ from functools import wraps
 from html import escape
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
-from avtorch.display.notebook import notebook_display
+from avtorch.display.frame import notebook_display
 from avtorch.threads import one_thread
 
 if TYPE_CHECKING:
@@ -165,19 +165,15 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
         bar.close()
 
 
-def asks_for_bar(progress: object) -> bool:
-    """Whether `progress` of a long call means a bar here: True does, and None in a notebook."""
-    return progress is True or (progress is None and notebook_display() is not None)
-
-
 def shows_progress(function: Callable[P, R]) -> Callable[P, R]:
-    """Gives `function`, a long call, the bar that its keyword `progress` asks for (see `asks_for_bar`), and one thread
+    """Gives `function`, a long call, a bar where its keyword `progress` is True, or None in a notebook, and one thread
     (see `avtorch.threads`)."""
 
     @wraps(function)
     def inner(*args: P.args, **kwargs: P.kwargs) -> R:
+        progress = kwargs.get("progress")
         with one_thread():
-            if asks_for_bar(kwargs.get("progress")):
+            if progress is True or (progress is None and notebook_display() is not None):
                 with progress_bar(function.__name__.replace("_", " ")) as step:
                     return function(*args, **{**kwargs, "progress": step})  # type: ignore[arg-type]
             return function(*args, **kwargs)

@@ -20,18 +20,7 @@ from avtorch.gap.result.hypotheses import Candidate
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.simulator.force_table import ForceTable, ResistanceCurve
 from avtorch.io.clock import time_label
-from avtorch.plots.style import (
-    BLACK,
-    BLUE,
-    GREY,
-    LABELS,
-    ORANGE,
-    SKY,
-    VERMILLION,
-    legend,
-    panels_of,
-    styled,
-)
+from avtorch.plots.style import BLACK, BLUE, GREY, LABELS, ORANGE, SKY, VERMILLION, legend, panels_of, styled
 
 _CELLS = 24  # a side of the force map
 _BINS = 30  # of a histogram

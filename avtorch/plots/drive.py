@@ -22,19 +22,7 @@ from avtorch.gap.result.manoeuvres import Manoeuvre
 from avtorch.gap.result.residuals import binned_means, correlation, residuals, spectrum, usual
 from avtorch.gap.result.traces import Alarm, Reason, Traces, Uncounted
 from avtorch.plots.diagnosis import budget_bars, traces_of
-from avtorch.plots.style import (
-    BLACK,
-    BLUE,
-    GREY,
-    LABELS,
-    ORANGE,
-    PURPLE,
-    VERMILLION,
-    WIDE,
-    legend,
-    panels_of,
-    styled,
-)
+from avtorch.plots.style import BLACK, BLUE, GREY, LABELS, ORANGE, PURPLE, VERMILLION, WIDE, legend, panels_of, styled
 
 Against = Literal["command", "speed", "frequency", "earlier commands"]
 

@@ -42,7 +42,7 @@ def actuation_of_cars(ax: Axes, cars: Sequence[Car]) -> Axes:
         ax.plot(these[:, 0], these[:, 1], ls="", marker=marker, color=colour, ms=5 if few else 3, rasterized=not few)
     first = [i for i, car in enumerate(known) if car["reason"] in kinds][:NAMED]
     for i in first if few else ():
-        ax.annotate(str(known[i]["rank"]), points[i], xytext=(4, 4), textcoords="offset points", fontsize=9)
+        ax.annotate(str(known[i]["rank"]), points[i], (4, 4), textcoords="offset points", fontsize=9)
     ax.set(xlabel="actuation lag T_L [s]", ylabel="actuation gain K_L")
     return ax
 
@@ -57,16 +57,8 @@ def stability_of_cars(ax: Axes, cars: Sequence[Car], target: float) -> Axes:
         for some, colour, marker in ((below, VERMILLION, "v"), (~below, BLUE, "o")):
             ax.plot(stable[some], share[some], ls="", marker=marker, color=colour, ms=5)
     ax.axvline(target, color=BLACK, lw=1.0, ls="--")
-    ax.annotate(
-        f"target {target:g}",
-        (target, 97),
-        xytext=(-4, 0),
-        textcoords="offset points",
-        ha="right",
-        va="top",
-        color=GREY,
-        fontsize=9,
-    )
+    look: Any = {"textcoords": "offset points", "ha": "right", "va": "top", "color": GREY, "fontsize": 9}
+    ax.annotate(f"target {target:g}", (target, 97), (-4, 0), **look)
     ax.set(xlabel="P(string stable)", ylabel="share of cars up to it [%]", xlim=(-0.03, 1.03), ylim=(0, 103))
     return ax
 

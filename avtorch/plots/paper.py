@@ -42,13 +42,14 @@ from avtorch.plots.style import (
 from avtorch.plots.time import belief_band, events, motion
 from avtorch.vehicle import stability
 
+_UPPER, _BOTH, _OURS = "as printed, upper level only", "as printed, with the lower level", "our strategist"
 #: One colour a kind of setting, here and in every picture of strategies.
 SETTINGS: dict[str, dict[str, Any]] = {
     "leader": {"color": GREY, "linewidth": 1.1},
     "no action": {"color": VERMILLION, "linewidth": 1.2},
-    "as printed, upper level only": {"color": ORANGE, "linewidth": 1.3},
-    "as printed, with the lower level": {"color": PURPLE, "linewidth": 1.3},
-    "our strategist": {"color": BLUE, "linewidth": 1.7},
+    _UPPER: {"color": ORANGE, "linewidth": 1.3},
+    _BOTH: {"color": PURPLE, "linewidth": 1.3},
+    _OURS: {"color": BLUE, "linewidth": 1.7},
 }
 
 _LINES = ((BLUE, "o"), (ORANGE, "s"), (PURPLE, "^"), (GREEN, "D"), (VERMILLION, "v"), (SKY, "P"), (BLACK, "X"))
@@ -109,27 +110,21 @@ _FORMS = {
 
 # the panel of a strategy, and what is drawn in it beside no action
 _PANELS = {
-    "Strategy 1": {"with": "Strategy 1 as printed", "ours": "our strategist, Strategy 1"},
+    "Strategy 1": {_BOTH: "Strategy 1 as printed", _OURS: "our strategist, Strategy 1"},
     "Strategy 2, time gap": {
-        "upper": "Strategy 2 as printed, upper level only",
-        "with": "Strategy 2 as printed, with the lower level",
-        "ours": "our strategist, Strategies 1 and 2",
+        _UPPER: "Strategy 2 as printed, upper level only",
+        _BOTH: "Strategy 2 as printed, with the lower level",
+        _OURS: "our strategist, Strategies 1 and 2",
     },
     "Strategy 3, gains": {
-        "upper": "Strategy 3 as printed, upper level only",
-        "with": "Strategy 3 as printed, with the lower level",
-        "ours": "our strategist, Strategies 1 and 3",
+        _UPPER: "Strategy 3 as printed, upper level only",
+        _BOTH: "Strategy 3 as printed, with the lower level",
+        _OURS: "our strategist, Strategies 1 and 3",
     },
-    "All strategies": {"ours": "our strategist, all strategies"},
+    "All strategies": {_OURS: "our strategist, all strategies"},
 }
 SHOWN_S = 20.0
 """From when on the strategies' drives are drawn [s]."""
-
-_KINDS = {
-    "upper": "as printed, upper level only",
-    "with": "as printed, with the lower level",
-    "ours": "our strategist",
-}
 
 
 def paper_pictures(found: Mapping[str, Any]) -> dict[str, Callable[[], Figure]]:
@@ -174,27 +169,22 @@ def regions_figure(found: Regions) -> Figure:
 @styled
 def estimation_figure(found: Estimation) -> Figure:
     """Estimates over both sweeps behind every leader, and the error along them."""
-    count = len(found.sweeps)
+    names, count = ("T_L", "K_L"), len(found.sweeps)
+    swept = (slice(0, len(LAGS)), slice(len(LAGS), None))  # settings in which the lag varies, and the gain
     figure = Figure(figsize=(11, 3.4 * count + 3.6), layout="constrained")
     grid = figure.add_gridspec(count + 1, 6)
-    first = None
     for i, sweep in enumerate(found.sweeps):
-        for j, (name, part) in enumerate((("T_L", slice(0, len(LAGS))), ("K_L", slice(len(LAGS), None)))):
+        for j, (name, part) in enumerate(zip(names, swept, strict=True)):
             ax = figure.add_subplot(grid[i, 3 * j : 3 * j + 3])
             _tracked(ax, sweep.truth[part, j], *(x[part, :, j] for x in (sweep.mean, sweep.q05, sweep.q95)), name=name)
             if j == 0:
                 ax.set_title(f"Behind {sweep.ahead.name}", fontsize=10)
-            first = ax if first is None else first
-    lags, gains = slice(0, len(LAGS)), slice(len(LAGS), None)
-    for k, (of, along, part) in enumerate((("T_L", "T_L", lags), ("K_L", "K_L", gains), ("T_L", "K_L", gains))):
+    for k, (of, along) in enumerate(((0, 0), (1, 1), (0, 1))):
         ax = figure.add_subplot(grid[count, 2 * k : 2 * k + 2])
-        column, swept = ("T_L", "K_L").index(of), ("T_L", "K_L").index(along)
-        errors = {s.ahead.name: s.error[part, :, column] for s in found.sweeps}
-        _errors(ax, found.sweeps[0].truth[part, swept], errors, along=along, of=of)
-        if k == 0:
-            ax.legend()
-    assert first is not None
-    first.legend(loc="upper left")
+        errors = {s.ahead.name: s.error[swept[along], :, of] for s in found.sweeps}
+        _errors(ax, found.sweeps[0].truth[swept[along], along], errors, along=names[along], of=names[of])
+    figure.axes[0].legend(loc="upper left")
+    figure.axes[2 * count].legend()
     return figure
 
 
@@ -230,7 +220,7 @@ def strategy_figure(found: Strategies, quantity: str) -> Figure:
     for ax, (title, drawn) in zip(axes, _PANELS.items(), strict=True):
         events(ax, change_s=CHANGE_S, actions=[{"time_s": ACT_S}])
         traces = {"leader": getattr(base, f"lead_{quantity}")[0], "no action": getattr(base, quantity)[0]}
-        traces |= {_KINDS[kind]: getattr(drives[name], quantity)[0] for kind, name in drawn.items()}
+        traces |= {kind: getattr(drives[name], quantity)[0] for kind, name in drawn.items()}
         _settings(ax, base.time, traces)
         ax.set_ylabel(LABELS[quantity])
         ax.set_title(title)
@@ -246,7 +236,7 @@ def strategy_verdict_figure(found: Strategies) -> Figure:
     axes = figure.subplots(1, len(_PANELS), sharey=True)
     omega = torch.logspace(-2, 1.3, 300, dtype=torch.float64)
     for ax, (title, drawn) in zip(axes, _PANELS.items(), strict=True):
-        names = {"no action": AS_BUILT, **{_KINDS[kind]: name for kind, name in drawn.items()}}
+        names = {"no action": AS_BUILT, **drawn}
         _one(ax)
         _settings(ax, omega, {kind: _gain(omega, found.driven[name]) for kind, name in names.items()})
         ax.set(xscale="log", xlabel="frequency ω [rad/s]")
@@ -284,12 +274,9 @@ def platoon_figure(found: Platoon) -> Figure:
     platoons = [i for i, name in enumerate(found.names) if not name.endswith("with the lower level")]
     figure = Figure(figsize=(11, 2.2 * len(platoons) + 3.8), layout="constrained")
     grid = figure.add_gridspec(len(platoons) + 1, 2, height_ratios=[1.0] * len(platoons) + [1.5])
-    first: Axes | None = None
-    panels: list[Axes] = []
     run = found.run
     for row, i in enumerate(platoons):
-        ax = figure.add_subplot(grid[row, :], sharex=first)
-        first = ax if first is None else first
+        ax = figure.add_subplot(grid[row, :], sharex=figure.axes[0] if row else None)
         hit = torch.nonzero((run.spacing[i, 0] <= 0).any(0))
         events(ax, change_s=CHANGE_S, actions=[] if i == 0 else [{"time_s": ACT_S}])
         shades = mpl.colormaps["viridis_r"](np.linspace(0.1, 0.95, len(run.speed[i, 0])))
@@ -303,9 +290,8 @@ def platoon_figure(found: Platoon) -> Figure:
         ax.set_xlim(float(run.time[0]), float(run.time[-1]))
         ax.set_ylabel(LABELS["speed"])
         ax.set_title(f"{found.names[i]}: peak gain {float(found.peak[i]):.3f}", fontsize=10)
-        panels.append(ax)
         ax.tick_params(labelbottom=i == platoons[-1])
-    panels[-1].set_xlabel("time [s]")
+    figure.axes[-1].set_xlabel("time [s]")
     for column, what in enumerate(("speed", "accel")):
         ax = figure.add_subplot(grid[len(platoons), column])
         ratios = middle(found.against_leader(what, PASSED_S), 1)
@@ -315,8 +301,7 @@ def platoon_figure(found: Platoon) -> Figure:
         word = "speed about its mean" if what == "speed" else "acceleration"
         ax.set_ylabel(f"RMS of the {word}\nover the leader's [-]")
         ax.set_title(f"From {PASSED_S:g} s on", fontsize=10)
-        panels.append(ax)
-    legend(figure, panels, where="lower center", columns=3)
+    legend(figure, figure.axes, where="lower center", columns=3)
     return figure
 
 

@@ -57,14 +57,11 @@ def verdict_map(
             ax.contour(x, y, mask.astype(float), levels=[0.5], colors=BLACK, linewidths=1.1, linestyles=style)
     if peak is not None:
         gain = np.asarray(peak, dtype=float)
-        # inf outside the stable part would end the contours one cell early
-        gain = np.where(np.isfinite(gain), gain, np.nan)
-        levels = (
-            [level for level in (1.1, 1.25, 1.5, 2.0, 3.0) if np.nanmin(gain) < level < np.nanmax(gain)]
-            if np.isfinite(gain).any()
-            else []
-        )
+        finite = gain[np.isfinite(gain)]
+        levels = [level for level in (1.1, 1.25, 1.5, 2.0, 3.0) if (finite < level).any() and (finite > level).any()]
         if levels:
+            # inf outside the stable part would end the contours one cell early
+            gain = np.where(np.isfinite(gain), gain, np.nan)
             lines = ax.contour(x, y, gain, levels=levels, colors="#B07A1E", linewidths=0.7)
             ax.clabel(lines, fmt=lambda g: f"{g:g}", fontsize=8, manual=_inside(lines, x, y))
     ax.grid(False)
@@ -100,11 +97,8 @@ def region(ax: Axes, plane: stability.Region, *, point: tuple[float, float] | No
     """
     verdict_map(ax, plane.x, plane.y, plane.local, plane.string, plane.peak_gain)
     if point is not None:
-        ax.plot(
-            *point, marker="o", markersize=9, color=BLUE, markeredgecolor="white", markeredgewidth=1.5, linestyle="none"
-        )
-    ax.set_xlabel(LABELS[plane.x_name])
-    ax.set_ylabel(LABELS[plane.y_name])
+        ax.plot(*point, "o", markersize=9, color=BLUE, markeredgecolor="white", markeredgewidth=1.5)
+    ax.set(xlabel=LABELS[plane.x_name], ylabel=LABELS[plane.y_name])
     return ax
 
 
@@ -114,9 +108,9 @@ def setting_region(
     *,
     T_range: tuple[float, float],
     K_range: tuple[float, float],
-    clouds: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
-    truth: tuple[float, float] | None = None,
-    points: int = 401,
+    clouds: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    truth: tuple[float, float] | None,
+    points: int,
 ) -> Axes:
     """The vehicles `(T_L, K_L)` that a setting, in the form of an answer, keeps string stable.
 
@@ -129,23 +123,12 @@ def setting_region(
     verdict_map(ax, T, K, stability.local_stable(*law), stability.string_stable(*law), stability.peak_gain(*law))
     # by shape as well as by colour: in grey they are the same
     looks = [(GREY, "^", 2), (PURPLE, "x", 3), (BLUE, ".", 3)]
-    named = list((clouds or {}).items())
-    for (name, (t, k)), (colour, marker, size) in zip(named, looks[-len(named) :], strict=False):
+    for (name, (t, k)), (colour, marker, size) in zip(clouds.items(), looks[-len(clouds) :], strict=False):
         look = {"marker": marker, "markersize": size, "color": colour, "alpha": 0.4}
         ax.plot(np.asarray(t), np.asarray(k), linestyle="none", label=name, zorder=3, **look)
     if truth is not None:
-        ax.plot(
-            *truth,
-            marker="P",
-            color=BLACK,
-            markersize=9,
-            markeredgecolor="white",
-            linestyle="none",
-            label="truth",
-            zorder=4,
-        )
-    ax.set_xlabel(LABELS["T_L"])
-    ax.set_ylabel(LABELS["K_L"])
+        ax.plot(*truth, "P", color=BLACK, markersize=9, markeredgecolor="white", label="truth", zorder=4)
+    ax.set(xlabel=LABELS["T_L"], ylabel=LABELS["K_L"])
     return ax
 
 
@@ -177,11 +160,8 @@ def gain_curve(ax: Axes, omega: ArrayLike, gain: ArrayLike, *, peak: tuple[float
         ax.plot(*peak, marker="o", color=VERMILLION, markersize=7, markeredgecolor="white")
         text = f"{peak[1]:.4g} at {peak[0]:.3g} rad/s"
         ax.annotate(text, peak, (8, 4), textcoords="offset points", color=VERMILLION, fontsize=9)
-    ax.set_xscale("log")
-    ax.set_xlim(omega[0], omega[-1])
-    ax.set_ylim(0, max(1.25, 1.15 * float(gain.max())))
-    ax.set_xlabel("frequency ω [rad/s]")
-    ax.set_ylabel("|G(jω)| [-]")
+    ax.set(xscale="log", xlabel="frequency ω [rad/s]", ylabel="|G(jω)| [-]")
+    ax.set(xlim=(omega[0], omega[-1]), ylim=(0, max(1.25, 1.15 * float(gain.max()))))
     return ax
 
 
@@ -243,8 +223,8 @@ def region_figure(
         >>> len(region_figure(settings, {"now": (T_L, K_L)}, truth=(1.5, 0.5)).axes)
         2
     """
-    t = np.concatenate([np.asarray(c[0]) for c in clouds.values()] + [[] if truth is None else [truth[0]]])
-    k = np.concatenate([np.asarray(c[1]) for c in clouds.values()] + [[] if truth is None else [truth[1]]])
+    drawn = [*clouds.values(), *([] if truth is None else [([truth[0]], [truth[1]])])]
+    t, k = (np.concatenate([np.asarray(each[i]) for each in drawn]) for i in (0, 1))
     # a few far draws of a broad belief must not squeeze the rest into a corner
     T_range = (0.02, max(1.0, 1.25 * float(np.quantile(t, 0.99)), 1.25 * (truth[0] if truth else 0.0)))
     K_range = (min(0.25, 0.8 * float(np.quantile(k, 0.01))), max(1.3, 1.15 * float(np.quantile(k, 0.99))))

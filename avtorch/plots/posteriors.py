@@ -69,8 +69,8 @@ def marginals(
     view, sd = [np.inf, -np.inf], np.nan
     if quadrature is not None:
         value, density = exact_density(quadrature, name, window)
-        ax.fill_between(value, density, facecolor=EXACT_FILL, edgecolor=EXACT, linewidth=1.0,
-                        label="exact (quadrature)", zorder=1.5)  # fmt: skip
+        area = {"facecolor": EXACT_FILL, "edgecolor": EXACT, "linewidth": 1.0, "zorder": 1.5}
+        ax.fill_between(value, density, label="exact (quadrature)", **area)
         view, sd = [value[0], value[-1]], float(quadrature.sd[window, quadrature.names.index(name)])
     looks = {"SGLD": {"color": BLUE, "linewidth": 1.6}, "NUTS": {"color": VERMILLION, "linewidth": 1.2, "ls": "--"}}
     for (label, look), draws in zip(looks.items(), (sgld_draws, nuts_draws), strict=True):
@@ -136,13 +136,13 @@ def joint_cloud(ax: Axes, clouds: Mapping[str, FloatArray], *, truth: tuple[floa
 
 def agreement_scatter(
     ax: Axes,
-    width: ArrayLike,
-    value: ArrayLike,
+    width: FloatArray,
+    value: FloatArray,
     *,
     limits: tuple[float, float],
-    error: ArrayLike | None = None,
-    converged: ArrayLike | None = None,
-    reach: float | None = None,
+    error: FloatArray,
+    converged: np.ndarray,
+    reach: float,
 ) -> Axes:
     """Distance of each window's posterior from the exact one over the latter's width, with the required limits.
 
@@ -154,18 +154,16 @@ def agreement_scatter(
         limits: between which it should be.
         error: Monte Carlo standard error of ``value``, ``(window,)``; twice its median is drawn as a bar at the left.
         converged: windows whose chains and reference both converged, ``(window,)``; the others are hollow.
-        reach: half height of the axis; by default it shows nearly all windows, and at least twice the limits.
+        reach: half height of the axis.
     """
-    x, y = 100 * np.asarray(width, dtype=float), np.asarray(value, dtype=float)
+    x, y = 100 * width, value
     middle = 0.5 * (limits[0] + limits[1])
-    reach = agreement_reach(y, limits) if reach is None else reach
     ax.axhspan(*limits, color=EXACT_FILL, alpha=0.5, linewidth=0, zorder=0.5, label="required limits")
     ax.axhline(middle, color=EXACT, linewidth=0.9, zorder=0.6)
     for limit in limits:
         ax.axhline(limit, color=EXACT, linewidth=0.9, linestyle="--", zorder=0.6)
     within = (y >= limits[0]) & (y <= limits[1])
     beyond = ~(np.abs(y - middle) <= reach)
-    sound = np.ones(len(y), bool) if converged is None else np.asarray(converged, bool)
     # NaN is drawn at the top
     edge = np.where(y < middle, middle - 0.95 * reach, middle + 0.95 * reach)
     at = np.where(beyond, edge, y)
@@ -177,25 +175,26 @@ def agreement_scatter(
     ]
     for mask, marker, colour, label, size in kinds:
         for good in (True, False):
-            chosen = mask & (sound == good)
+            chosen = mask & (converged == good)
             if chosen.any() or (good and label):
                 look: Any = {"alpha": 0.6, "markeredgewidth": 0} if good else {"fillstyle": "none"}
                 text = label if good else "not converged"
                 ax.plot(x[chosen], at[chosen], marker, color=colour, markersize=size, label=text, **look)
-    if error is not None:
-        spread = float(np.nanmedian(np.asarray(error, dtype=float)))
-        ax.plot([0.03, 0.03], [middle - 2 * spread, middle + 2 * spread], "_-", color=BLACK, linewidth=1.3, zorder=4,
-                transform=ax.get_yaxis_transform(), label="±2 Monte Carlo errors of a window")  # fmt: skip
+    spread = float(np.nanmedian(error))
+    look = {"color": BLACK, "linewidth": 1.3, "zorder": 4, "label": "±2 Monte Carlo errors of a window"}
+    bar = [middle - 2 * spread, middle + 2 * spread]
+    ax.plot([0.03, 0.03], bar, "_-", transform=ax.get_yaxis_transform(), **look)
     ax.set_title(f"{100 * within.mean():.0f} % within", loc="left")
     _percent_axis(ax, x)
     ax.set_ylim(middle - reach, middle + reach)
     return ax
 
 
-def agreement_reach(value: ArrayLike, limits: tuple[float, float]) -> float:
-    """Half height of an axis for values that should be within limits: 2.2 to 12 times the distance to a limit."""
+def agreement_reach(value: FloatArray, limits: tuple[float, float]) -> float:
+    """Half height of an axis that shows nearly all values that should be within limits: 2.2 to 12 times the distance to
+    a limit."""
     middle, half = 0.5 * (limits[0] + limits[1]), 0.5 * (limits[1] - limits[0])
-    away = np.abs(np.asarray(value, dtype=float) - middle)
+    away = np.abs(value - middle)
     away = away[np.isfinite(away)]
     return float(np.clip(1.1 * np.quantile(away, 0.98) if len(away) else 0.0, 2.2 * half, 12 * half))
 
@@ -466,12 +465,7 @@ def _wide(names: tuple[str, ...]) -> float:
 
 
 def _panels(
-    rows: int,
-    columns: int,
-    panel: tuple[float, float],
-    *,
-    beside: float = 0.3,
-    sharey: Literal["row"] | bool = False,
+    rows: int, columns: int, panel: tuple[float, float], *, beside: float = 0.3, sharey: Literal["row"] | bool = False
 ) -> tuple[Figure, np.ndarray]:
     """A figure and its axes (row, column), each of a `panel`'s width and height [in]."""
     wide, high = panel

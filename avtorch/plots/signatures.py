@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import matplotlib.pyplot as plt
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -105,8 +104,8 @@ def signature_figure() -> Figure:
     effects = sorted(typical, key=lambda e: (PLACES.index(e.place), e.order, e.name))
     columns = 4
     rows = -(-len(effects) // columns)
-    size = (13, 2.1 * rows + 0.5)
-    figure, axes = plt.subplots(rows, columns, figsize=size, sharex=True, sharey=True, layout="constrained")
+    figure = Figure(figsize=(13, 2.1 * rows + 0.5), layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True)
     for ax, effect in zip(axes.flat, effects, strict=False):
         effect_signature(ax, effect)
         ax.set_title(effect.place, loc="right", fontsize=8, color=GREY, fontweight="normal")

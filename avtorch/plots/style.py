@@ -21,7 +21,7 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import StepPatch
 
 from avtorch.arrays import FloatArray
-from avtorch.display.notebook import notebook_display
+from avtorch.display.frame import notebook_display
 from avtorch.io import atomic
 
 BLUE, VERMILLION, GREEN, ORANGE, SKY, PURPLE = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#A6407E"

@@ -27,7 +27,6 @@ Windows = Sequence[Mapping[str, Any]]
 Steps = Sequence[tuple[float, float]]
 """A quantity that jumps: `(from this time on [s], value)`."""
 
-
 Motion = Mapping[str, Mapping[str, ArrayLike]]
 """Traces of a run: `{"speed": {"leader": ..., "without action": ..., "with action": ...}, "accel": {...}, ...}`."""
 
@@ -46,26 +45,20 @@ def motion(ax: Axes, time: ArrayLike, traces: Mapping[str, ArrayLike], *, quanti
         ax.axhspan(low, 0.0, color=GREY, alpha=0.25, linewidth=0, zorder=0)
         ax.text(0.99, 0.03, "below 0: collision", transform=ax.transAxes, ha="right", color=BLACK, fontsize=8)
         ax.set_ylim(low, high)
-    ax.set_ylabel(LABELS.get(quantity, quantity))
-    return _span(ax, np.asarray(time)[[0, -1]])
+    ax.set(ylabel=LABELS.get(quantity, quantity), xlim=np.asarray(time)[[0, -1]])
+    return ax
 
 
 def belief_band(
-    ax: Axes,
-    windows: Windows,
-    name: str,
-    *,
-    truth: Steps | None = None,
-    bounds: tuple[float, float] | None = None,
+    ax: Axes, windows: Windows, name: str, *, truth: Steps | None = None, bounds: tuple[float, float] | None = None
 ) -> Axes:
     """The belief about one parameter: 90 % interval and mean of each window, paler where the window was not used.
 
     `truth`: the true value. `bounds`: the design bounds that the controller was built for.
     """
     if bounds is not None:
-        ax.axhspan(
-            *bounds, facecolor="none", edgecolor="#BBBBBB", hatch="////", linewidth=0, zorder=0, label="design bounds"
-        )
+        look: Any = {"facecolor": "none", "edgecolor": "#BBBBBB", "hatch": "////", "linewidth": 0, "zorder": 0}
+        ax.axhspan(*bounds, label="design bounds", **look)
     for used, colour, label in ((True, BLUE, "90 % interval"), (False, GREY, "carried over (window not used)")):
         x, low = _staircase(windows, name, "q05", used)
         _, high = _staircase(windows, name, "q95", used)
@@ -73,13 +66,11 @@ def belief_band(
         if np.isfinite(mean).any():
             ax.fill_between(x, low, high, color=colour, alpha=0.3 if used else 0.18, linewidth=0, label=label)
             ax.plot(x, mean, color=colour, linewidth=1.8 if used else 1.0, label="mean" if used else None)
-    if truth is not None and windows:
-        end = windows[-1]["end_s"]
-        x = [t for t, _ in truth] + [end]
-        ax.step(x, [v for _, v in truth] + [truth[-1][1]], where="post", color=BLACK, linestyle="--", label="truth")
-    ax.set_ylabel(LABELS.get(name, name))
-    ax.set_ylim(*_reach(windows, name, truth, bounds))
-    return _span(ax, _ends(windows))
+    if truth is not None:
+        x, y = zip(*truth, (windows[-1]["end_s"], truth[-1][1]), strict=True)
+        ax.step(x, y, where="post", color=BLACK, linestyle="--", label="truth")
+    ax.set(ylabel=LABELS.get(name, name), ylim=_reach(windows, name, truth, bounds), xlim=_ends(windows))
+    return ax
 
 
 def string_probability(ax: Axes, windows: Windows, *, actions: Iterable[Mapping[str, Any]] = ()) -> Axes:
@@ -89,19 +80,17 @@ def string_probability(ax: Axes, windows: Windows, *, actions: Iterable[Mapping[
     ends = [(w["end_s"], w["p_string_stable"]) for w in windows]
     chosen = [(a["time_s"], a["p_string_stable"]) for a in actions if a.get("p_string_stable") is not None]
     known = sorted([*ends, *chosen], key=lambda each: each[0])  # an action comes after the window that led to it
-    if known:
-        x, p = (np.array(column, dtype=float) for column in zip(*known, strict=True))
-        ax.fill_between(x, p, step="post", color=SKY, alpha=0.25, linewidth=0)
-        ax.step(x, p, where="post", color=BLUE)
-        for below, colour, size in ((False, BLUE, 3), (True, VERMILLION, 6)):
-            some = [(t, value) for t, value in ends if (value < TARGET) == below]
-            if some:
-                ax.plot(*zip(*some, strict=True), marker="o", markersize=size, linestyle="none", color=colour, zorder=3)
+    x, p = (np.array(column, dtype=float) for column in zip(*known, strict=True))
+    ax.fill_between(x, p, step="post", color=SKY, alpha=0.25, linewidth=0)
+    ax.step(x, p, where="post", color=BLUE)
+    for below, colour, size in ((False, BLUE, 3), (True, VERMILLION, 6)):
+        some = [(t, value) for t, value in ends if (value < TARGET) == below]
+        if some:
+            ax.plot(*zip(*some, strict=True), marker="o", markersize=size, linestyle="none", color=colour, zorder=3)
     # in the legend: beside its line a label would lie over dots and alerts
     ax.axhline(TARGET, color=GREY, linestyle=(0, (1, 1.5)), linewidth=1.2, label=f"target {TARGET:g}")
-    ax.set_ylim(-0.02, 1.05)
-    ax.set_ylabel("P(string stable) [-]")
-    return _span(ax, _ends(windows))
+    ax.set(ylabel="P(string stable) [-]", ylim=(-0.02, 1.05), xlim=_ends(windows))
+    return ax
 
 
 def events(
@@ -122,7 +111,7 @@ def events(
     return ax
 
 
-def data_quality(ax: Axes, log: Log, windows: Windows = ()) -> Axes:
+def data_quality(ax: Axes, log: Log, windows: Windows) -> Axes:
     """Which rows of a log serve: recorded, masked (driver, standstill); and which windows were excited.
 
     Times are from the log's start.
@@ -141,12 +130,8 @@ def data_quality(ax: Axes, log: Log, windows: Windows = ()) -> Axes:
     ax.set_yticks(range(len(lanes)), [name for name, _, _ in lanes])
     ax.set_ylim(len(lanes) - 0.4, -0.6)
     ax.grid(False, axis="y")
-    return _span(ax, time[[0, -1]])
-
-
-def _used(window: Mapping[str, Any]) -> bool:
-    """Whether the belief is the window's own: an excited one whose chains did not settle is carried over, too."""
-    return bool(window.get("used", window["excited"]))
+    ax.set_xlim(time[0], time[-1])
+    return ax
 
 
 def _staircase(windows: Windows, name: str, key: str, used: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -157,7 +142,7 @@ def _staircase(windows: Windows, name: str, key: str, used: bool) -> tuple[np.nd
         if x and w["start_s"] > x[-1] + 1e-6:
             x.append(x[-1])
             y.append(np.nan)
-        value = w[name][key] if _used(w) == used else np.nan
+        value = w[name][key] if w["used"] == used else np.nan
         x += [w["start_s"], w["end_s"]]
         y += [value, value]
     return np.array(x), np.array(y)
@@ -165,9 +150,9 @@ def _staircase(windows: Windows, name: str, key: str, used: bool) -> tuple[np.nd
 
 def _reach(windows: Windows, name: str, truth: Steps | None, bounds: tuple[float, float] | None) -> tuple[float, float]:
     """Limits of the axis: used windows, truth and bounds in full; a broad first prior may run out of the picture."""
-    used = [w for w in windows if _used(w)] or list(windows)
-    values = [w[name][q] for w in used for q in ("q05", "q95")] + [v for _, v in truth or []] + list(bounds or ())
-    low, high = min(values, default=0.0), max(values, default=1.0)
+    used = [w for w in windows if w["used"]] or windows
+    values = [*(w[name][q] for w in used for q in ("q05", "q95")), *(v for _, v in truth or ()), *(bounds or ())]
+    low, high = min(values), max(values)
     pad = 0.08 * (high - low or 1.0)
     return max(0.0, low - pad), high + pad
 
@@ -181,14 +166,8 @@ def _runs(log: Log, mask: np.ndarray, step: float) -> list[tuple[float, float]]:
     ]
 
 
-def _ends(windows: Windows) -> np.ndarray:
-    return np.array([windows[0]["start_s"], windows[-1]["end_s"]]) if windows else np.array([0.0, 1.0])
-
-
-def _span(ax: Axes, ends: np.ndarray) -> Axes:
-    if ends[1] > ends[0]:
-        ax.set_xlim(float(ends[0]), float(ends[1]))
-    return ax
+def _ends(windows: Windows) -> tuple[float, float]:
+    return windows[0]["start_s"], windows[-1]["end_s"]
 
 
 # figures -------------------------------------------------------------------------------------------------------------

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from avtorch.gap.quantity import Quantity, unit_behind, words_of
+from avtorch.gap.result.comparison import ChangeCause, Comparison, detectable_text
+from avtorch.gap.result.log_facts import LogFacts
 from avtorch.report.page import Origin, Page, Picture, Section, Tone, picture_of
 from avtorch.report.table import Table
 
 if TYPE_CHECKING:
     from avtorch.external import SimulatorComparison
-    from avtorch.gap.result.comparison import ChangeCause, Comparison
-    from avtorch.gap.result.log_facts import LogFacts
 
 _ROWS = {
     "T_L": "lag T_L [s]",
@@ -20,32 +20,28 @@ _ROWS = {
     "rollout_rmse_accel": "acceleration error, {horizon} s [m/s²]",
     "rollout_rmse_speed": "speed error, {horizon} s [m/s]",
 }
-_OF_SIMULATOR: Mapping[str, tuple[str, Tone]] = {
-    "closer": ("the simulator is closer to the car after", "green"),
-    "farther": ("the simulator is farther from the car after", "amber"),
-    "inconclusive": ("whether the simulator is closer cannot be told", "blue"),
+_OF_SIMULATOR: Mapping[str, tuple[str, str, Tone]] = {
+    "closer": ("the simulator is closer to the car after", "The simulator after is closer to the car", "green"),
+    "farther": ("the simulator is farther from the car after", "The simulator after is farther from the car", "amber"),
+    "inconclusive": (
+        "whether the simulator is closer cannot be told",
+        "Which simulator is closer to the car cannot be told",
+        "blue",
+    ),
 }
-_ONE_DRIVE = {
-    "closer": "The simulator after is closer to the car",
-    "farther": "The simulator after is farther from the car",
-    "inconclusive": "Which simulator is closer to the car cannot be told",
-}
+"""What is said of two drives, and of two simulators of one drive."""
 
 
 def comparison_html(
     found: Comparison | SimulatorComparison, *, notes: Sequence[str] = (), origin: Origin | None = None
 ) -> str:
     """The page of a comparison as text; `notes`: on the data."""
-    from avtorch.gap.result.comparison import Comparison
-
     page = _of_drives(found, notes) if isinstance(found, Comparison) else _of_simulators(found, notes)
     return page.html(origin)
 
 
 def comparison_tables(found: Comparison | SimulatorComparison) -> tuple[Table, Table]:
     """The errors before and after, or of the first and the second; and what has changed or differs, as far as known."""
-    from avtorch.gap.result.comparison import Comparison
-
     if isinstance(found, Comparison):
         moved = {**found.car, **found.gap}
         rows = [
@@ -72,8 +68,6 @@ def comparison_tables(found: Comparison | SimulatorComparison) -> tuple[Table, T
 
 def _cause_table(cause: ChangeCause | None) -> Table:
     """Parts of the change, or the least changes that would show."""
-    from avtorch.gap.result.comparison import detectable_text
-
     if cause is None or not cause.parts:
         least = () if cause is None else tuple((name, detectable_text(name, x)) for name, x in cause.detectable.items())
         return Table("What would show", ("least change that would show", "size"), least)
@@ -94,7 +88,7 @@ def _cause_table(cause: ChangeCause | None) -> Table:
 
 # two sets of drives ------------------------------------------------------------------------------------------------
 def _of_drives(found: Comparison, notes: Sequence[str]) -> Page:
-    said, tone = _OF_SIMULATOR[found.simulator]
+    said, of_one_drive, tone = _OF_SIMULATOR[found.simulator]
     one_drive = found.before == found.after
     car = "The car has changed" if found.changed else "No change of T_L and K_L is detected"
     table, parts = comparison_tables(found)
@@ -105,7 +99,7 @@ def _of_drives(found: Comparison, notes: Sequence[str]) -> Page:
         "Comparison",
         _facts(found.before) if one_drive else f"before: {_facts(found.before)}; after: {_facts(found.after)}",
         Section(
-            _ONE_DRIVE[found.simulator] if one_drive else f"{car}; {said}",
+            of_one_drive if one_drive else f"{car}; {said}",
             (found.why,),
             (_ratios("after / before", ratios, table, none),),
         ),

@@ -360,8 +360,8 @@ def _residuals(found: Diagnosis) -> Section:
         return Section(title)
     both = drive.residuals_of(found)
     last = list(both.values())[-1]
-    pictures = [_residual_against(found, traces, both, name, axis) for name, axis in _axes(traces)]
     outside = correlation(traces, last)
+    pictures = [_residual_against(found, traces, both, axis) for axis in _axes(traces)]
     pictures.append(
         picture_of(
             "residual-correlation",
@@ -382,8 +382,8 @@ def _residuals(found: Diagnosis) -> Section:
     return Section(title, said, (_residual_over_time(found, traces, both),), tuple(pictures))
 
 
-def _axes(traces: Traces) -> list[tuple[Literal["command", "speed"], FloatArray]]:
-    return [("command", traces.command), *([] if traces.speed is None else [("speed", traces.speed)])]
+def _axes(traces: Traces) -> list[Literal["command", "speed"]]:
+    return ["command"] if traces.speed is None else ["command", "speed"]
 
 
 def _what_is_left(traces: Traces, both: Mapping[str, FloatArray], outside: Correlation) -> tuple[str, ...]:
@@ -395,7 +395,7 @@ def _what_is_left(traces: Traces, both: Mapping[str, FloatArray], outside: Corre
     sizes = [f"{np.sqrt(np.mean(residual**2)):.2g} m/s² {label}" for label, residual in both.items()]
     said = [f"{what}: {', '.join(sizes)} (root mean square)."]
     last = list(both.values())[-1]
-    shows = [name for name, axis in _axes(traces) if _apart(binned_means(traces, axis, last))]
+    shows = [axis for axis in _axes(traces) if _apart(binned_means(traces, getattr(traces, axis), last))]
     late = outside.lag[(outside.lag >= 0) & (np.abs(outside.value) > outside.band)]
     who = "The simulator with what was named" if len(both) > 1 else "The baseline simulator"
     if shows:
@@ -434,18 +434,18 @@ def _residual_over_time(found: Diagnosis, traces: Traces, both: Mapping[str, Flo
 
 
 def _residual_against(
-    found: Diagnosis, traces: Traces, both: Mapping[str, FloatArray], name: drive.Against, axis: FloatArray
+    found: Diagnosis, traces: Traces, both: Mapping[str, FloatArray], axis: Literal["command", "speed"]
 ) -> Picture:
-    unit = "m/s²" if name == "command" else "m/s"
+    unit = "m/s²" if axis == "command" else "m/s"
     rows = []
     for label, residual in both.items():
-        bins = binned_means(traces, axis, residual)
+        bins = binned_means(traces, getattr(traces, axis), residual)
         for place, mean, low, high in zip(bins.place, bins.mean, bins.low, bins.high, strict=True):
             within = f" ({low:.3f} to {high:.3f})" if np.isfinite(low) else ""
             rows.append((f"{place:.3g} {unit}", label, f"{mean:.3f}{within}"))
     return picture_of(
-        f"residual-{name}",
-        drive.residual_figure(found, name),
-        Table(f"Mean residual by {name}", (name, "simulator", "mean residual (90 %) [m/s²]"), tuple(rows)),
-        caption=f"Against the {name}: means of as many rows each; bands are 90 %, by blocks of {BLOCK_S:.0f} s.",
+        f"residual-{axis}",
+        drive.residual_figure(found, axis),
+        Table(f"Mean residual by {axis}", (axis, "simulator", "mean residual (90 %) [m/s²]"), tuple(rows)),
+        caption=f"Against the {axis}: means of as many rows each; bands are 90 %, by blocks of {BLOCK_S:.0f} s.",
     )

@@ -29,7 +29,7 @@ _IMPLAUSIBLE = "physically implausible"
 _FAINT = 0.01  # hypotheses less probable than this are only counted
 
 
-def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
+def budget_table(budget: Budget, epoch_s: float) -> Table:
     """What each cause contributes to the gap, or without any what the error consists of; times count from `epoch_s`."""
     share = "share of the gap (90 %)" if budget.parts else "share of the error"
     several = any(len(part.alias_set) > 1 for part in (*budget.parts, *budget.chance))

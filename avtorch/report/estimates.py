@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from avtorch.errors import InputError
 from avtorch.io.clock import from_start
 from avtorch.plots.time import TARGET, belief_figure, probability_figure
 from avtorch.report.page import Origin, Page, Picture, Section, Tone, picture_of
@@ -20,15 +19,10 @@ if TYPE_CHECKING:
 
 
 def estimates_html(found: Estimates, log: Log, *, notes: Iterable[str] = (), origin: Origin | None = None) -> str:
-    """The page of the estimate `found` on `log`, as text; `notes`: on the data, beside those of its check.
-
-    Raises `InputError` where no window was estimated.
-    """
+    """The page of the estimate `found` on `log`, as text; `notes`: on the data, beside those of its check."""
     answer = estimates_answer(found)
     epoch_s = answer["epoch_s"]
     windows, alerts = (from_start(answer[key], epoch_s) for key in ("windows", "alerts"))
-    if not windows:
-        raise InputError("found: has no windows, needs the estimate of a log")
     facts = f"{log.name} · {len(windows)} windows of {windows[0]['end_s'] - windows[0]['start_s']:g} s"
     spread = answer["spread_over_sd"]
     told = (estimates_note(answer), *_stability(windows, answer["assumed"]))

@@ -255,12 +255,9 @@ def _siblings(beside: Mapping[str, Any] | None) -> str:
     if beside is None:
         return ""
     name = min(_UNITS, key=lambda n: beside[n]["tail"])
-    tail = f"tail {_small(beside[name]['tail'])}"
+    p = beside[name]["tail"]
+    tail = "tail <1e-12" if p < 1e-12 else f"tail {p:.2g}"
     return tail if beside["q_value"] > APART else f"{name} {beside[name]['ratio']:.2f} times theirs, {tail}"
-
-
-def _small(p: float) -> str:
-    return "<1e-12" if p < 1e-12 else f"{p:.2g}"
 
 
 def _interval(q: Mapping[str, float], form: str = ".2f") -> str:

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from importlib.resources import files
+from itertools import count
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -57,29 +58,18 @@ class Origin:
             inside = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
             for file in inside:
                 name = str(file.relative_to(path.parent))
+                # two drives may have one name in two folders
+                names = (name if number == 1 else f"{name} ({number})" for number in count(1))
                 with file.open("rb") as stream:
-                    # two drives may have one name in two folders
-                    files[_free(name, files)] = hashlib.file_digest(stream, "sha256").hexdigest()
+                    digits = hashlib.file_digest(stream, "sha256").hexdigest()
+                files[next(free for free in names if free not in files)] = digits
         return cls(command, files, None if settings is None else fingerprint(settings))
-
-
-def _free(name: str, taken: Mapping[str, str]) -> str:
-    number = 2
-    free = name
-    while free in taken:
-        free, number = f"{name} ({number})", number + 1
-    return free
 
 
 def versions() -> str:
     """Of avtorch and of what computes, in one line."""
-    found = {
-        "avtorch": __version__,
-        "torch": version("torch"),
-        "numpy": version("numpy"),
-        "Python": platform.python_version(),
-    }
-    return ", ".join(f"{name} {number}" for name, number in found.items())
+    computes = ", ".join(f"{name} {version(name)}" for name in ("torch", "numpy"))
+    return f"avtorch {__version__}, {computes}, Python {platform.python_version()}"
 
 
 Tone = Literal["blue", "green", "amber"]
@@ -99,10 +89,8 @@ _COLOURS = {
     "#fbe6c4": "p-amplifies",
     "#ddd3d8": "p-unstable",
     "#b07a1e": "p-contour",
-    "#dcdcdc": "p-fill",
     "#bbbbbb": "p-bar",
     "#dddddd": "p-fill",
-    "#d5d5d5": "p-fill",  # a band of ranks
     "#dadada": "p-fill",  # an exact density
     "#555555": "soft",  # its outline
     "#e6e6e6": "p-grid",
@@ -171,9 +159,11 @@ class Page:
         # thousands of dots are an image within the page
         pictures = [picture for section in (page.lead, *page.sections) for picture in section.pictures if picture]
         policy = "; img-src data:" if any("<image" in picture.svg for picture in pictures) else ""
-        policy += f"; script-src 'sha256-{_digest(script)}'" if script else ""
+        if script:
+            digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+            policy += f"; script-src 'sha256-{digest}'"
         frame = {"style": Markup(text_of("style.css")), "origin": origin or Origin(), "versions": versions()}
-        return _template("page.html").render(page=page, policy=Markup(policy), script=script, **frame)
+        return _TEMPLATES.get_template("page.html").render(page=page, policy=Markup(policy), script=script, **frame)
 
 
 def written(text: str, folder: str | PathLike[str], name: str) -> Path:
@@ -185,12 +175,7 @@ def written(text: str, folder: str | PathLike[str], name: str) -> Path:
 
 
 def picture_of(
-    name: str,
-    figure: Figure,
-    *tables: Table,
-    says: str = "",
-    caption: str = "",
-    opened: bool = False,
+    name: str, figure: Figure, *tables: Table, says: str = "", caption: str = "", opened: bool = False
 ) -> Picture:
     """A figure for the page; where they are not given, what it says and its tables are those of its lines."""
     # draws, and needs matplotlib
@@ -241,7 +226,11 @@ def inline_svg(name: str, figure: Figure, says: str) -> Markup:
     # a style inside a picture would be the whole page's; the page has its own
     text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", text, flags=re.DOTALL)
     text = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", text)
-    text = re.sub(r"((?:fill|stroke): )(#[0-9a-f]{6})", _colour, text)
+    text = re.sub(
+        r"((?:fill|stroke): )(#[0-9a-f]{6})",
+        lambda m: m[1] + (f"var(--{_COLOURS[m[2]]})" if m[2] in _COLOURS else m[2]),
+        text,
+    )
     text = re.sub(r"-?\d+\.\d{3,}", lambda m: f"{float(m[0]):.2f}", text)
     # letters are of one size on a desk, whatever the width of the figure; a phone shows a part of a wide one
     most = _PX_A_POINT * 72 * figure.get_figwidth()
@@ -252,13 +241,9 @@ def inline_svg(name: str, figure: Figure, says: str) -> Markup:
     return opening.format(printable(says), Markup(view[0]), most, _LEAST * most) + Markup(text)
 
 
-def _colour(found: re.Match[str]) -> str:
-    return found[1] + (f"var(--{_COLOURS[found[2]]})" if found[2] in _COLOURS else found[2])
-
-
 def fragment(template: str, **values: Any) -> Markup:
     """A part of a page by its template in this package."""
-    return Markup(_template(template).render(**values))
+    return Markup(_TEMPLATES.get_template(template).render(**values))
 
 
 def text_of(name: str, package: str = "avtorch.report") -> str:
@@ -266,25 +251,19 @@ def text_of(name: str, package: str = "avtorch.report") -> str:
     return files(package).joinpath(name).read_text(encoding="utf-8")
 
 
-def _template(name: str) -> Any:
-    environment = Environment(
-        autoescape=True,
-        undefined=StrictUndefined,
-        finalize=_seen,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        loader=FunctionLoader(text_of),
-    )
-    return environment.get_template(name)
-
-
-def _digest(script: str) -> str:
-    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-
-
 def _seen(value: Any) -> Any:
     """Text of a page, its control characters escaped; markup of our own, the pictures, as it is."""
     return value if isinstance(value, Markup) or not isinstance(value, str) else printable(value)
+
+
+_TEMPLATES = Environment(
+    autoescape=True,
+    undefined=StrictUndefined,
+    finalize=_seen,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    loader=FunctionLoader(text_of),
+)
 
 
 def markdown(page: Page, origin: Origin | None = None) -> str:
@@ -306,12 +285,9 @@ def _body(section: Section) -> list[str]:
 
 
 def _table(table: Table) -> str:
+    titles, *rows = ([_text(cell) for cell in row] for row in (table.columns, *table.rows))
     sides = ["---:" if title in table.numeric else "---" for title in table.columns]
-    return "\n".join([_row(table.columns), _row(sides, raw=True), *map(_row, table.rows)])
-
-
-def _row(cells: Iterable[str], *, raw: bool = False) -> str:
-    return f"| {' | '.join(cells if raw else map(_text, cells))} |"
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (titles, sides, *rows))
 
 
 def _text(text: str) -> str:

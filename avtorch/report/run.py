@@ -18,12 +18,7 @@ from avtorch.report.table import Table
 from avtorch.results import MEASURES
 from avtorch.vehicle import stability
 
-_STRATEGIES = {
-    1: "the lower level",
-    2: "the time gap",
-    3: "the gains",
-    4: "the leader's acceleration fed forward",
-}
+_STRATEGIES = {1: "the lower level", 2: "the time gap", 3: "the gains", 4: "the leader's acceleration fed forward"}
 _MOST = 40  # rows of the story
 _DOTS, _POINTS = 150, 301  # draws of a cloud, points of a map's axis: more would make a page of megabytes
 
@@ -37,9 +32,9 @@ def run_html(
     time: ArrayLike,
     traces: Motion,
     *,
-    truth: Mapping[str, Steps] | None = None,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    regions: Regions | None = None,
+    truth: Mapping[str, Steps],
+    bounds: Mapping[str, tuple[float, float]],
+    regions: Regions,
     origin: Origin | None = None,
 ) -> str:
     """The page of a run as text; arguments as of `avtorch.plots.overview_figure`.
@@ -63,7 +58,7 @@ def run_html(
         (
             Section("What happened", tables=(story,), items=(f"{more} more in run.json.",) if more else ()),
             Section("The motion", pictures=(motion,)),
-            Section("Beliefs and stability regions", pictures=_regions(regions, truth)),
+            Section("Beliefs and stability regions", pictures=(_region(regions, truth),)),
             Section(
                 "Method and limits",
                 items=(
@@ -148,9 +143,7 @@ def _number(value: float | None) -> str:
 def story_table(answer: Mapping[str, Any]) -> Table:
     """The change, alerts and actions in order, the first of them."""
     change = answer["change"]
-    lines = [
-        (change["time_s"], "change", f"the vehicle changes to T_L {change['T_L']:g} s, K_L {change['K_L']:g}"),
-    ]
+    lines = [(change["time_s"], "change", f"the vehicle changes to T_L {change['T_L']:g} s, K_L {change['K_L']:g}")]
     for a, more in begun(answer):
         again = f" (and in {more} more window{'s' * (more > 1)})" if more else ""
         lines.append((a["time_s"], "alert", f"{a['detector']}: {a['why']}{again}"))
@@ -162,22 +155,19 @@ def story_table(answer: Mapping[str, Any]) -> Table:
     return Table("Events in order", ("time [s]", "what", "why"), rows)
 
 
-def _regions(regions: Regions | None, truth: Mapping[str, Steps] | None) -> tuple[Picture, ...]:
-    if regions is None:
-        return ()
-    now = None if truth is None else (float(truth["T_L"][-1][1]), float(truth["K_L"][-1][1]))
+def _region(regions: Regions, truth: Mapping[str, Steps]) -> Picture:
+    now = (float(truth["T_L"][-1][1]), float(truth["K_L"][-1][1]))
     settings, draws = regions
     clouds = {name: (np.asarray(T)[:_DOTS], np.asarray(K)[:_DOTS]) for name, (T, K) in draws.items()}
-    drawn = picture_of(
+    return picture_of(
         "region",
         region_figure(settings, clouds, truth=now, points=_POINTS),
         _shares(regions, now),
         caption="A dot is a draw of the belief. String stable is what lies in the blue.",
     )
-    return (drawn,)
 
 
-def _shares(regions: Regions, now: tuple[float, float] | None) -> Table:
+def _shares(regions: Regions, now: tuple[float, float]) -> Table:
     """Of each belief, T_L and K_L, and the share that is string stable under each setting."""
     settings, clouds = regions
     columns = ("vehicle", "T_L [s] (90 %)", "K_L (90 %)", *(f"string stable {name}" for name, _ in settings))
@@ -186,10 +176,9 @@ def _shares(regions: Regions, now: tuple[float, float] | None) -> Table:
         some = [np.asarray(values, dtype=float) for values in (T, K)]
         told = [f"{x.mean():.3f} ({np.quantile(x, 0.05):.2f} to {np.quantile(x, 0.95):.2f})" for x in some]
         rows.append((name, *told, *(f"{100 * _stable(setting, *some):.0f} %" for _, setting in settings)))
-    if now is not None:
-        one = [np.array([x]) for x in now]
-        held = ("yes" if _stable(setting, *one) else "no" for _, setting in settings)
-        rows.append(("truth", f"{now[0]:g}", f"{now[1]:g}", *held))
+    one = [np.array([x]) for x in now]
+    held = ("yes" if _stable(setting, *one) else "no" for _, setting in settings)
+    rows.append(("truth", f"{now[0]:g}", f"{now[1]:g}", *held))
     return Table("The beliefs, and the share of each that is string stable", columns, tuple(rows))
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from avtorch.errors import InputError
-
 
 @dataclass(frozen=True)
 class Table:
@@ -14,7 +12,6 @@ class Table:
 
     `caption`: what the table shows. `numeric`: titles of the columns of numbers. `marked`: numbers of the rows in bold;
     `soft`: of those that a terminal dims.
-    Raises `InputError` where a row has another number of cells than there are columns.
     """
 
     caption: str
@@ -23,10 +20,3 @@ class Table:
     numeric: Collection[str] = ()
     marked: Collection[int] = ()
     soft: Collection[int] = ()
-
-    def __post_init__(self) -> None:
-        for i, row in enumerate(self.rows):
-            if len(row) != len(self.columns):
-                raise InputError(
-                    f"table {self.caption!r}: found {len(row)} cells in row {i}, needs {len(self.columns)}"
-                )

@@ -52,10 +52,7 @@ def _sections(found: Validation) -> list[Section]:
         "ecdf": ("Exact probabilities below the draws", _ecdfs),
     }
     return [
-        Section(
-            title,
-            pictures=(picture_of(name, figures[f"{name}.png"](), table(chosen)),),
-        )
+        Section(title, pictures=(picture_of(name, figures[f"{name}.png"](), table(chosen)),))
         for name, (title, table) in parts.items()
         if f"{name}.png" in figures
     ]
