@@ -46,6 +46,7 @@ _SENSOR_LAG, _SCALE, _BIAS = INDEX["sensor_lag"], INDEX["sensor_scale"], INDEX["
 _LEAST_FACTOR = 0.05  # as in `effects.speed_dependent_gain`
 _FREE_DAMPING = 0.5  # of the unnamed mode: no resonance, which would be a driveline's
 _CREEP_OVER = 0.5  # [m/s] as in `effects.low_speed_creep`
+_SAME_S = 1e-10  # rows are even but for their rounding
 _NEUTRAL = NEUTRAL.copy()
 _COUNT = len(NEUTRAL)
 
@@ -144,13 +145,13 @@ def simulate(
     force = before_shown = 0.0
     first = 0
     k1 = 0
-    keep = keep_T = keep_h = -1.0
-    m00 = m01 = m10 = m11 = 0.0
-    m_T = m_h = -1.0
+    # of each part of a step: its transition, and the lag and length that it is of
+    keep, m00, m01, m10, m11 = np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2)
+    of_T, of_length, of_square = np.full(2, -1.0), np.full(2, -1.0), np.full(2, -1.0)
     r00 = r01 = r10 = r11 = f00 = f01 = f10 = f11 = 0.0
     ring_h = -1.0
     s_keep = s_old = s_new = s_h = s_lag = -1.0
-    m_square = until = -1.0
+    until = -1.0
     up_limit = down_limit = slower = brake_gain = brake_lag = 1.0
     for k in range(n):
         t, v = time[k], max(speed[k], 0.0)
@@ -195,7 +196,7 @@ def simulate(
             reading = shown
         else:
             h = time[k] - time[k - 1]
-            if h != s_h or q[_SENSOR_LAG] != s_lag:
+            if abs(h - s_h) > _SAME_S or q[_SENSOR_LAG] != s_lag:
                 s_h, s_lag = h, q[_SENSOR_LAG]
                 s_keep = math.exp(-h / s_lag)
                 held = -s_lag / h * math.expm1(-h / s_lag)
@@ -222,8 +223,8 @@ def simulate(
                 s = shift_speeds[g]
                 if v > s and not above[g]:
                     rise = v - speed[k - 1] if k > first else 0.0
-                    part = min(max((v - s) / rise, 0.0), 1.0) if rise > 0.0 else 0.0
-                    since[g] = t + (1.0 - part) * h
+                    share = min(max((v - s) / rise, 0.0), 1.0) if rise > 0.0 else 0.0
+                    since[g] = t + (1.0 - share) * h
                     above[g] = True
                 above[g] = above[g] and v > s - p[_HYSTERESIS]
                 covered = (min(t + h, since[g] + p[_DURATION]) - max(t, since[g])) / h
@@ -260,15 +261,16 @@ def simulate(
         if q[_DEPTH] > 0.0 and lost > 0.0 and u2 > 0.0:
             gain *= 1.0 - q[_DEPTH] * lost
         before = a
-        for part_number in range(2):
-            c = u1 if part_number == 0 else u2
-            length = h1 if part_number == 0 else h - h1
+        for part in range(2):
+            c = u1 if part == 0 else u2
+            length = h1 if part == 0 else h - h1
             if length <= 0.0:
                 continue
             target, T = gain * c, lag
             if c < 0.0:
                 target *= brake_gain
                 T *= brake_lag
+            other = of_T[part] != T or abs(length - of_length[part]) > _SAME_S
             if q[_SQUARE] > 0.0:
                 if q[_JERK] > 1e-9:
                     d = target - slewed
@@ -278,11 +280,11 @@ def simulate(
                     missed = moving * 0.5 * (d + target - after) + (length - moving) * (target - after)
                     slewed = after
                     target -= missed / length
-                if m_T != T or length != m_h or m_square != q[_SQUARE]:
-                    m00, m01, m10, m11 = modes(q[_SQUARE], T, length)
-                    m_T, m_h, m_square = T, length, q[_SQUARE]
+                if other or of_square[part] != q[_SQUARE]:
+                    m00[part], m01[part], m10[part], m11[part] = modes(q[_SQUARE], T, length)
+                    of_T[part], of_length[part], of_square[part] = T, length, q[_SQUARE]
                 d = a - target
-                after, swing = target + m00 * d + m01 * w, m10 * d + m11 * w
+                after, swing = target + m00[part] * d + m01[part] * w, m10[part] * d + m11[part] * w
                 v_gained += target * length - T * (after - a) - (swing - w)
                 a, w = after, swing
             elif q[_JERK] > 1e-9:
@@ -296,15 +298,15 @@ def simulate(
                 v_gained += (a + 0.5 * cut) * at_limit + rest * target + T * decay * left
                 a = target - left * (1.0 + decay)
             else:
-                if keep_T != T or length != keep_h:
-                    keep = math.exp(-length / T)
-                    keep_T, keep_h = T, length
-                after = target + keep * (a - target)
+                if other or of_square[part] != 0.0:
+                    keep[part] = math.exp(-length / T)
+                    of_T[part], of_length[part], of_square[part] = T, length, 0.0
+                after = target + keep[part] * (a - target)
                 v_gained += target * length - T * (after - a)
                 a = after
         # modes that the actuator's jerk excites
         if p[_RING_A] != 0.0 or p[_RING_Q] != 0.0 or p[_FREE] != 0.0:
-            if h != ring_h:
+            if abs(h - ring_h) > _SAME_S:
                 ring_h = h
                 omega, damping = 2.0 * math.pi * p[_RING_F], p[_RING_Z]
                 r00, r01, r10, r11 = modes(1.0 / (omega * omega), 2.0 * damping / omega, h)
