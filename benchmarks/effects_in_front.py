@@ -208,7 +208,7 @@ def _beside_the_same(budget: Budget, alone: Hypothesis, effect: str, epoch_s: fl
         return None
     h = alone
     for part in budget.parts:
-        if part.name in budget.names and part.name in EFFECTS:
+        if part.name in budget.names and part.name in map(base_name, TRIED):  # what chance decides is in the noise
             h = with_part(h, part, epoch_s)
     h = fit(h, 12)
     kept = next(e for e in h.effects if base_name(e) == effect)
