@@ -6,13 +6,14 @@ import gc
 import importlib
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests import shapes
+from tests.report.in_chromium import PROGRAM
 
 shapes.install()
 
@@ -70,3 +71,14 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[[list[str]], str]:
         return told.err
 
     return said
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """Chromium: one a process, for a second one cannot be started beside it."""
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as play:
+        # the sandbox needs rights that containers lack, and the pages are our own
+        program = play.chromium.launch(executable_path=PROGRAM, args=["--no-sandbox"])
+        yield program
+        program.close()

@@ -14,7 +14,6 @@ import pytest
 
 import avtorch
 from avtorch.gap import DeadTime, SensorBias, plant
-from tests.report.conftest import browser as browser  # the same Chromium as the report's
 from tests.report.in_chromium import Scheme, marks
 
 # found, not imported: that takes seconds of every worker that only collects

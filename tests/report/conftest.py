@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
@@ -14,7 +12,6 @@ from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.remedy import setting_for
 from avtorch.report.diagnosis import report_html
 from benchmarks.blindtest import draw_case
-from tests.report.in_chromium import PROGRAM
 
 HOSTILE = '<script>alert(1)</script>"&{{ 7 * 7 }}.csv'
 
@@ -45,13 +42,3 @@ def found(ahead: Experiment) -> Diagnosis:
 @pytest.fixture(scope="session")
 def page_text(found: Diagnosis, ahead: Experiment) -> str:
     return report_html(found, experiment=ahead, quality=["2 rows masked"], sections={"The loop": ["It is closed."]})
-
-
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Any]:
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as play:
-        # the sandbox needs rights that containers lack, and the pages are our own
-        program = play.chromium.launch(executable_path=PROGRAM, args=["--no-sandbox"])
-        yield program
-        program.close()
