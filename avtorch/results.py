@@ -86,7 +86,7 @@ def estimates_answer(estimates: Estimates) -> dict[str, Any]:
     Times are on the log's own clock; `epoch_s` is its first row's.
     """
     # imported here: no other answer needs the estimators, which take a tenth of a second
-    from avtorch.inference.sequential import AGAINST_SGLD
+    from avtorch.inference.estimators.other_posteriors import AGAINST_SGLD
 
     setting = estimates.setting
     return {

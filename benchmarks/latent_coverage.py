@@ -21,10 +21,11 @@ from torch import Tensor
 
 from avtorch.inference.density import Density
 from avtorch.inference.estimators import ImportanceSampling
+from avtorch.inference.estimators.other_posteriors import FIRST
 from avtorch.inference.importance import weighted_draws
 from avtorch.inference.latent import LatentDensity, default_noise_prior
 from avtorch.inference.map import Mode
-from avtorch.inference.sequential import FIRST, Solved
+from avtorch.inference.sequential import Solved
 from tests.inference.latent_windows import drawn_window
 
 KINDS = {

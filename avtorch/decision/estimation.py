@@ -34,7 +34,7 @@ from avtorch.display import Card, Displayed, Frame
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief
-from avtorch.inference.estimator import Form
+from avtorch.inference.form import Form
 from avtorch.inference.jerk import JerkForm
 from avtorch.inference.latent import LatentForm
 from avtorch.inference.stream import BeliefStream, Window, packed, unpacked

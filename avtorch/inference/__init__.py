@@ -19,7 +19,7 @@ from avtorch.inference.density import (
     SelectableDensity,
     SubsampledDensity,
 )
-from avtorch.inference.estimator import Form, WindowLikelihood
+from avtorch.inference.form import Form, WindowLikelihood
 from avtorch.inference.jerk import (
     ExcitationRule,
     JerkDensity,

@@ -1,64 +1,19 @@
-"""What every estimator in a stream of windows takes, and what all of them share.
-
-It takes a form of the log density, and the likelihood that the form gives of a window of rows. Shared are a belief per
-vehicle, what an estimator remembers beside it, and resume.
-"""
+"""What all estimators in a stream of windows share: a belief per vehicle, what one remembers beside it, and resume."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Bool, Real
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief, Summary
-from avtorch.inference.density import Density
 from avtorch.inference.device import Device, checked_device
+from avtorch.inference.form import Form, Rows, WindowLikelihood
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior
-from avtorch.inference.sampler_settings import SamplerSettings
-
-Rows = Mapping[str, Tensor]
-"""One window: ``time`` ``(time,)`` [s] and ``usable`` and the measured columns, each ``(vehicle, time)``."""
-
-
-@dataclass(frozen=True)
-class WindowLikelihood:
-    """The likelihood of one window of every vehicle: with a prior it gives a posterior density.
-
-    `n`: usable rows, ``(vehicle,)``. `excited`: ``(vehicle,)`` bool, by the fixed rule. `density`: the posterior
-    density of the vehicles named by an index, from their priors.
-    """
-
-    n: Real[Tensor, " vehicle"]
-    excited: Bool[Tensor, " vehicle"]
-    density: Callable[[Tensor, Prior], Density]
-
-
-class Form(Protocol):
-    """A form of the log density: its columns, its parameters, and the likelihood of a window of rows."""
-
-    @property
-    def names(self) -> tuple[str, ...]: ...
-
-    @property
-    def columns(self) -> tuple[str, ...]: ...
-
-    @property
-    def noise_prior(self) -> Prior: ...
-
-    @property
-    def sampler(self) -> SamplerSettings:
-        """Default settings of the sampler for its posteriors."""
-        ...
-
-    def likelihood(self, rows: Rows, full: float) -> WindowLikelihood:
-        """The likelihood of a window; ``full`` is the number of rows of a complete one."""
-        ...
 
 
 class Estimator(ABC):

@@ -16,7 +16,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float, Int, Real
 from avtorch.inference.density import ExponentialForm, PotentialTerms
 from avtorch.inference.device import Device
-from avtorch.inference.estimator import Rows, WindowLikelihood
+from avtorch.inference.form import Rows, WindowLikelihood
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
 from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.vehicle.arguments import Batch, Signal

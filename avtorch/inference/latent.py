@@ -17,7 +17,7 @@ from avtorch.arrays import Bool, Float, Int, Real
 from avtorch.errors import InputError
 from avtorch.inference.compiled import load_kernels
 from avtorch.inference.device import Device
-from avtorch.inference.estimator import Rows, WindowLikelihood
+from avtorch.inference.form import Rows, WindowLikelihood
 from avtorch.inference.latent_model import ACCEL_SD0, SPEED_SD0, latent_log_likelihood
 from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior
 from avtorch.inference.sampler_settings import SamplerSettings

@@ -19,8 +19,8 @@ from avtorch.display import Card, Displayed
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief
 from avtorch.inference.device import Device, checked_device
-from avtorch.inference.estimator import Form
 from avtorch.inference.estimators import make_estimator
+from avtorch.inference.form import Form
 from avtorch.inference.jerk import JerkForm
 from avtorch.inference.stream_units import StreamUnits
 from avtorch.io import Damaged

@@ -17,7 +17,7 @@ import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.inference.estimator import Rows
+from avtorch.inference.form import Rows
 from avtorch.inference.jerk import JerkStatistics
 from avtorch.io.units import GRAVITY
 from avtorch.io.validity import ACCEL_FACTORS, SAME_MOTION, SPEED_FACTORS, integral, late_response, scale_between

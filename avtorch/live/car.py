@@ -17,7 +17,7 @@ from avtorch.decision.monitor import Monitor
 from avtorch.decision.settings import Setting
 from avtorch.decision.watch import Watch, WatchedWindow
 from avtorch.errors import InputError
-from avtorch.inference.estimator import Form
+from avtorch.inference.form import Form
 from avtorch.inference.jerk import JerkForm
 from avtorch.inference.latent import LatentForm
 from avtorch.inference.stream import BeliefStream

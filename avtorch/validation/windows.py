@@ -15,7 +15,7 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.inference.density import Density, SelectableDensity
-from avtorch.inference.estimator import Form
+from avtorch.inference.form import Form
 from avtorch.inference.jerk import ExcitationRule, JerkDensity, JerkForm, JerkStatistics
 from avtorch.inference.latent import LatentForm
 from avtorch.inference.priors import Joint, default_actuation_prior

@@ -13,10 +13,11 @@ from avtorch.errors import InputError
 from avtorch.inference import integrate
 from avtorch.inference.density import Density
 from avtorch.inference.estimators import ImportanceSampling
+from avtorch.inference.estimators.other_posteriors import FIRST
 from avtorch.inference.importance import ImportanceSettings, WeightedDraws, weighted_draws
 from avtorch.inference.latent import LatentDensity, LatentWindow, default_noise_prior
 from avtorch.inference.map import Mode
-from avtorch.inference.sequential import FIRST, Solved
+from avtorch.inference.sequential import Solved
 from avtorch.validation import synthetic_windows
 from tests.bars import BAR
 from tests.inference.latent_windows import drawn_window

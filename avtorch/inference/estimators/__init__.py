@@ -7,10 +7,12 @@ import inspect
 from typing import Any
 
 from avtorch.errors import InputError
-from avtorch.inference.estimator import Estimator, Form, WindowedEstimator
+from avtorch.inference.estimator import Estimator, WindowedEstimator
 from avtorch.inference.estimators.kalman import JointEKF, JointUKF
+from avtorch.inference.estimators.other_posteriors import ImportanceSampling, MaximumAPosteriori
 from avtorch.inference.estimators.rls import RecursiveLeastSquares
-from avtorch.inference.sequential import ImportanceSampling, MaximumAPosteriori, SequentialInference
+from avtorch.inference.form import Form
+from avtorch.inference.sequential import SequentialInference
 
 __all__ = [
     "ESTIMATORS",

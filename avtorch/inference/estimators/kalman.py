@@ -26,7 +26,8 @@ from torch import Tensor
 from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.inference.belief import Summary
-from avtorch.inference.estimator import Form, Rows, WindowedEstimator
+from avtorch.inference.estimator import WindowedEstimator
+from avtorch.inference.form import Form, Rows
 from avtorch.inference.jerk import JerkForm, JerkStatistics
 from avtorch.inference.latent import GAP, NOISE_PRIOR, LatentForm
 from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, Step, discretise, initial_covariance

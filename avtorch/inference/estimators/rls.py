@@ -20,7 +20,8 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.inference.belief import Z90, Summary
-from avtorch.inference.estimator import Form, Rows, WindowedEstimator
+from avtorch.inference.estimator import WindowedEstimator
+from avtorch.inference.form import Form, Rows
 from avtorch.inference.jerk import JerkStatistics
 
 CLEAR = 4.0
