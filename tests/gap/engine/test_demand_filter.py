@@ -14,6 +14,7 @@ from avtorch.gap.engine.demand_filter import (
     frame_cover,
     information_of_coefficients,
     precision,
+    pulse_energy,
     take_out,
 )
 from avtorch.gap.engine.drive_data import DriveData
@@ -89,17 +90,18 @@ def test_scores_of_many_columns_are_those_of_each(fresh_seed: int) -> None:
 
 def test_take_out_is_the_product_with_the_information(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
-    n, first = 40, 33
+    n, rows = 40, np.array([3, 4, 33, 34, 39])
     information, cover, pulse = rng.normal(size=9), rng.random(n), rng.normal(size=5)
     score = rng.normal(size=n)
     whole = np.zeros(n)
-    whole[first : first + 5] = pulse
+    whole[rows] = pulse
     dense = cover[:, None] * toeplitz(np.concatenate([information, np.zeros(n - 9)])) * cover
     beside = score.copy()
-    take_out(beside, information, cover, pulse, first, 1.0)
+    take_out(beside, information, cover, rows, pulse, 1.0)
     np.testing.assert_allclose(beside, score - dense @ whole, atol=1e-12)
-    take_out(beside, information, cover, pulse, first, -1.0)
+    take_out(beside, information, cover, rows, pulse, -1.0)
     np.testing.assert_allclose(beside, score, atol=1e-12)
+    assert pulse_energy(information, cover, rows, pulse) == pytest.approx(whole @ dense @ whole, abs=1e-12)
 
 
 def test_frames_see_the_middle_and_no_end_of_a_stretch() -> None:
