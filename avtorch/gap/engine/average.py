@@ -446,8 +446,8 @@ def _weights(x: Examined, examined: list[Examined]) -> Iterator[Weight]:
                 # losses that are too short to be found one by one delay each frame by their mean: no other cause
                 labels[0] = (names, 0.0)
             elif names and h.force is None and c.nats > 0 and c.form not in SIGNS:
-                # or one cause without a name does it all, and the names are but terms of its description; what chance
-                # does no name describes
+                # or one cause without a name does it all, and the names are but terms of its description; but no name
+                # describes what chance does
                 labels.append((None, -UNKNOWN_NATS + (each - TRIED_NATS) * count))
         total, kinds = dict(c.total), [slow for slow in SLOW if slow in c.total]
         if h.alone:  # some slow force is any drive's

@@ -93,6 +93,14 @@ def test_the_first_sheet_with_a_table_is_read(tmp_path: Path, form: str) -> None
     assert channels["Speed"].time is channels["Accel [m/s2]"].time
 
 
+@pytest.mark.parametrize(("unit", "seconds"), [("min", 60.0), ("minutes", 60.0), ("hours", 3600.0)])
+def test_times_in_a_unit_by_any_of_its_names_are_converted(tmp_path: Path, unit: str, seconds: float) -> None:
+    """Minutes and hours in full were taken for seconds."""
+    rows = [["Time", "Speed"], [unit, "m/s"], *([t / seconds, 20.0] for t in TIMES)]
+    channels = open_here(xlsx(tmp_path / "drive.xlsx", {"a": rows})).read(["Speed"])
+    np.testing.assert_allclose(channels["Speed"].time, TIMES)
+
+
 def test_empty_cells_and_texts_are_nan_and_are_told(tmp_path: Path) -> None:
     rows = [["t", "speed", "accel"], [0.0, 1.0, 5.0], [0.1, None, "fast"], [None, 3.0, 7.0], [0.3, "4.5", 8.0]]
     recording = open_here(xlsx(tmp_path / "drive.xlsx", {"a": rows}))
